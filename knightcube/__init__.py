@@ -33,6 +33,25 @@ if TYPE_CHECKING:
     from knightcube.errors import KnightCubeError as KnightCubeError
     from knightcube.errors import PlanningError as PlanningError
     from knightcube.errors import UsageError as UsageError
+    from knightcube.gnc.control.detumble import Detumbler as Detumbler
+    from knightcube.gnc.control.detumble import DetumblerSettings as DetumblerSettings
+    from knightcube.gnc.control.detumble import WindowSchedule as WindowSchedule
+    from knightcube.gnc.control.pointing_law import PointingLaw as PointingLaw
+    from knightcube.gnc.control.pointing_law import plan_pointing as plan_pointing
+    from knightcube.gnc.control.pointing_table import PointingWeights as PointingWeights
+    from knightcube.gnc.estimation.attitude_filter import AttitudeFilter as AttitudeFilter
+    from knightcube.gnc.estimation.attitude_filter import AttitudeFilterSettings as AttitudeFilterSettings
+    from knightcube.gnc.estimation.consistency import Consistency as Consistency
+    from knightcube.gnc.estimation.consistency import attitude_error as attitude_error
+    from knightcube.gnc.estimation.consistency import check_consistency as check_consistency
+    from knightcube.gnc.estimation.estimate import AttitudeMeasurement as AttitudeMeasurement
+    from knightcube.gnc.estimation.estimate import DirectionMeasurement as DirectionMeasurement
+    from knightcube.gnc.estimation.estimate import FieldMeasurement as FieldMeasurement
+    from knightcube.gnc.estimation.estimate import MeanRateMeasurement as MeanRateMeasurement
+    from knightcube.gnc.estimation.estimate import RateMeasurement as RateMeasurement
+    from knightcube.gnc.estimation.field_rate import FieldRate as FieldRate
+    from knightcube.gnc.estimation.field_rate import FieldRateSettings as FieldRateSettings
+    from knightcube.gnc.estimation.rigid_body import RigidBody as RigidBody
     from knightcube.gnc.guidance.plant import SingleAxisPlant as SingleAxisPlant
     from knightcube.gnc.guidance.pointing_target import Goal as Goal
     from knightcube.gnc.guidance.pointing_target import PointingTarget as PointingTarget
@@ -56,7 +75,17 @@ if TYPE_CHECKING:
 
 _MODULE_OF = {
     "ArgumentError": "knightcube.errors",
+    "AttitudeFilter": "knightcube.gnc.estimation.attitude_filter",
+    "AttitudeFilterSettings": "knightcube.gnc.estimation.attitude_filter",
+    "AttitudeMeasurement": "knightcube.gnc.estimation.estimate",
     "CalibrationError": "knightcube.vision.lens_knowledge",
+    "Consistency": "knightcube.gnc.estimation.consistency",
+    "Detumbler": "knightcube.gnc.control.detumble",
+    "DetumblerSettings": "knightcube.gnc.control.detumble",
+    "DirectionMeasurement": "knightcube.gnc.estimation.estimate",
+    "FieldMeasurement": "knightcube.gnc.estimation.estimate",
+    "FieldRate": "knightcube.gnc.estimation.field_rate",
+    "FieldRateSettings": "knightcube.gnc.estimation.field_rate",
     "GeomagneticError": "knightcube.astro.earth.geomagnetism",
     "Goal": "knightcube.gnc.guidance.pointing_target",
     "HorizonKnowledge": "knightcube.vision.horizon.settings",
@@ -66,15 +95,23 @@ _MODULE_OF = {
     "LensCalibration": "knightcube.vision.lens_calibration",
     "LensError": "knightcube.vision.camera.lens",
     "MatchedStars": "knightcube.vision.star_tracker",
+    "MeanRateMeasurement": "knightcube.gnc.estimation.estimate",
     "OrbitError": "knightcube.astro.earth.orbit_knowledge",
     "Pinhole": "knightcube.vision.camera.lens",
     "PlanningError": "knightcube.errors",
+    "PointingLaw": "knightcube.gnc.control.pointing_law",
     "PointingTarget": "knightcube.gnc.guidance.pointing_target",
+    "PointingWeights": "knightcube.gnc.control.pointing_table",
+    "RateMeasurement": "knightcube.gnc.estimation.estimate",
+    "RigidBody": "knightcube.gnc.estimation.rigid_body",
     "SingleAxisPlant": "knightcube.gnc.guidance.plant",
     "StarSolution": "knightcube.vision.star_tracker",
     "StarTracker": "knightcube.vision.star_tracker",
     "UsageError": "knightcube.errors",
+    "WindowSchedule": "knightcube.gnc.control.detumble",
+    "attitude_error": "knightcube.gnc.estimation.consistency",
     "calibrate_lens": "knightcube.vision.lens_calibration",
+    "check_consistency": "knightcube.gnc.estimation.consistency",
     "detect_objects": "knightcube.vision.objects.detect",
     "estimate_rate": "knightcube.vision.streaks.estimate",
     "find_nadir": "knightcube.vision.horizon.nadir",
@@ -82,6 +119,7 @@ _MODULE_OF = {
     "magnetic_field": "knightcube.astro.almanac",
     "magnetic_field_on_ground": "knightcube.astro.almanac",
     "orbit_state": "knightcube.astro.almanac",
+    "plan_pointing": "knightcube.gnc.control.pointing_law",
     "plan_slew": "knightcube.gnc.guidance.slew_plan",
     "plan_step": "knightcube.gnc.guidance.vmc",
     "propagate_elements": "knightcube.astro.almanac",

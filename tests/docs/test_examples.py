@@ -181,6 +181,7 @@ NUMBER = re.compile(r"[+-]?\d+\.?\d*")
 @pytest.mark.parametrize(
     ("page", "script"),
     [
+        ("filters-and-controllers", "filters_and_controllers"),
         ("horizon-and-sun", "horizon_and_sun"),
         ("lens", "lens"),
         ("orbit", "orbit_and_field"),

@@ -359,6 +359,16 @@ CALLS: dict[str, dict[str, Any]] = {
         "longest": 700.0, "window": 0.0, "time_cost": 0.01, "pointing_axis": [0, 0, 1],
         "across_axis": [1, 0, 0], "camera_axis": [0, 0, 1], "cones": {"moon": 0.2}, "nodes": 12,
     },
+    "plan_pointing": {
+        "inertia": [1e-3] * 3, "dipole_limit": [0.1] * 3, "elements": LINES, "time": NOON,
+        "target": PointingTarget(Goal.SUN), "quaternion": [0, 0, 0, 1], "rate": [0, 0, 0],
+        "weights": LIB.PointingWeights(turn=0.02, rate=1.0, dipole=3e-4), "pointing_axis": [0, 0, 1],
+        "across_axis": [1, 0, 0],
+    },
+    "attitude_error": {"true": [0, 0, 0, 1], "estimated": [0, 0, 0, 1]},
+    "check_consistency": {
+        "errors": [[1.0]], "covariances": [[[1.0]]], "confidence": 0.9, "independent": 1,
+    },
     "PointingTarget": {"goal": Goal.GROUND, "numbers": (0.1, 0.2), "roll": 0.1},
     "Goal.named": {"label": "sun"},
     "Pinhole": {"columns": 64, "rows": 64, "focal_length": 300.0},

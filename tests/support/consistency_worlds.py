@@ -15,7 +15,7 @@ from scipy.stats import chi2
 
 from knightcube.astro.arrays import FloatArray, cross_product
 from knightcube.astro.quaternion import about_axis_y, normalise
-from knightcube.gnc.estimation.attitude_filter import FilterSettings
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilterSettings
 from knightcube.gnc.estimation.estimate import Parameters
 from sim_hal.worlds.testbed import Testbed, TestbedModel
 
@@ -41,7 +41,7 @@ class Push:
     walk: float
 
 
-KNOWN_PLANT = FilterSettings(
+KNOWN_PLANT = AttitudeFilterSettings(
     current_noise=0.0,
     control_period=CYCLE_NS * 1e-9,
     disturbance_walk=0.0,

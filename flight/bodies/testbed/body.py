@@ -58,7 +58,7 @@ from knightcube.gnc.control.detumble import (
     WindowSchedule,
     share_in_rotating_field,
 )
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings, slow_prior
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, AttitudeFilterSettings, slow_prior
 from knightcube.gnc.estimation.estimate import (
     ATTITUDE,
     RATE,
@@ -350,7 +350,7 @@ def attitude_filter(
         stiffness=plant.stiffness,
         damping=plant.damping,
     )
-    settings = FilterSettings(
+    settings = AttitudeFilterSettings(
         current_noise=section.current_noise,
         control_period=1.0 / CONTROL_RATE_HZ,
         disturbance_walk=section.disturbance_walk,

@@ -55,7 +55,7 @@ from knightcube.gnc.control.one_axis import (
     ExcitationSettings,
     LqTracker,
 )
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, AttitudeFilterSettings
 from knightcube.gnc.estimation.estimate import NOMINAL, PARAMETERS, Estimate, Parameters, SlowPrior
 from knightcube.gnc.estimation.rigid_body import RigidBody
 from knightcube.gnc.guidance.path_guidance import PathGuidance
@@ -661,7 +661,11 @@ class CageFilter(AttitudeFilter):
     """The testbed's filter in a Helmholtz cage, whose field is predicted at the time of each command."""
 
     def __init__(
-        self, cage: CageField, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None
+        self,
+        cage: CageField,
+        body: RigidBody,
+        settings: AttitudeFilterSettings,
+        prior: SlowPrior | None = None,
     ) -> None:
         """Start the filter of `body` in the field of `cage`."""
         super().__init__(body, settings, prior)

@@ -33,7 +33,11 @@ _NO_CURRENT: FloatArray = np.zeros(3)
 
 @dataclass(frozen=True, slots=True)
 class WindowSchedule:
-    """Durations (ns) of the phases of a window: settle and measure (coils off), act (coils on)."""
+    """Durations (ns) of the phases of a window: settle and measure (coils off), act (coils on).
+
+    The field of the coils decays while they settle, and each window needs a magnetometer sample while they
+    measure.
+    """
 
     settle_ns: int
     measure_ns: int
@@ -124,7 +128,11 @@ def braking_current(
 
 
 class Detumbler:
-    """A B-dot detumbler that accepts magnetometer samples and returns the coil currents of each cycle."""
+    """A B-dot detumbler that accepts magnetometer samples and returns the coil currents of each cycle.
+
+    The coils must be off while the field is measured: apply the result of `current` in every cycle. The rate
+    along the field cannot be reduced.
+    """
 
     def __init__(self, schedule: WindowSchedule, braking: DetumblerSettings) -> None:
         self._schedule = schedule

@@ -414,7 +414,7 @@ STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
 """Spans of tables for targets of unlimited duration (first value) and for a passing object (second value)."""
 _COVERED = 1.25
 """Minimum length of the prediction for a target of unlimited duration, in revolutions of the orbit."""
-_LONGEST = 10_000.0
+LONGEST_PREVIEW = 10_000.0
 """Longest prediction (s), a revolution and a quarter at an altitude of 2,200 km."""
 LEAD = 2.0
 """Time (s) between the estimated state and the start of the table, during which the table is computed."""
@@ -504,7 +504,7 @@ def new_table(job: PointingJob) -> PointingTable:
     span = job.span
     preview = span.preview
     if span is STEADY:
-        preview = min(max(preview, _COVERED * job.orbit.period), _LONGEST)
+        preview = min(max(preview, _COVERED * job.orbit.period), LONGEST_PREVIEW)
     ahead = predict(job.orbit, preview + 4.0 * STEADY.step)
     times = np.arange(LEAD, preview, span.step)
     kept = round(span.kept / span.step)

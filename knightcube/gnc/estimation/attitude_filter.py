@@ -225,7 +225,7 @@ class CommandCheck:
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
-class FilterSettings:
+class AttitudeFilterSettings:
     """Noise and limits of the attitude filter.
 
     Attributes:
@@ -237,7 +237,7 @@ class FilterSettings:
         bias_walk: random walk of the gyro bias, rad/s per sqrt(s).
         bias_start: initial standard deviation of the gyro bias, rad/s.
         torsion_start: initial standard deviation of the thread's torsion, 1/s^2; zero if the torsion is
-            known.
+            known. A free body has no thread.
         damping_start: initial standard deviation of the thread's damping, 1/s; zero if the damping is known.
         gain_start: initial standard deviation of the coils' gain; zero if the gain is known.
         latency_start: initial standard deviation of the age of the inertial unit's samples, s; zero if the
@@ -259,17 +259,17 @@ class FilterSettings:
     disturbance_start: float = 0.02
     bias_walk: float = 1e-7
     bias_start: float
-    torsion_start: float
-    damping_start: float
-    gain_start: float
-    latency_start: float
-    latency_walk: float
+    torsion_start: float = 0.02
+    damping_start: float = 4e-3
+    gain_start: float = 0.15
+    latency_start: float = 0.03
+    latency_walk: float = 3e-3
     field_bias_start: float = 0.0
     field_bias_walk: float = 0.0
     rate_walk: float = 0.0
     unknown_current: float = 0.0
-    gate_sigma: float
-    history_ns: int
+    gate_sigma: float = 15.0
+    history_ns: int = 6_000_000_000
 
     def __post_init__(self) -> None:
         """Raise ArgumentError for a value that is negative or not a finite number.
@@ -284,7 +284,7 @@ def free_axes(body: RigidBody) -> FloatArray:
     return np.array([0.0, 1.0, 0.0]) if body.suspended else np.ones(3)
 
 
-def error_state(body: RigidBody, settings: FilterSettings, prior: SlowPrior) -> ErrorState:
+def error_state(body: RigidBody, settings: AttitudeFilterSettings, prior: SlowPrior) -> ErrorState:
     """Return the error state for `body`. A block with a prior covariance of zero is not estimated."""
     free = free_axes(body)
     latency = np.array([[prior.latency_variance]])
@@ -302,7 +302,7 @@ def error_state(body: RigidBody, settings: FilterSettings, prior: SlowPrior) -> 
     )
 
 
-def process_noise(body: RigidBody, settings: FilterSettings, layout: ErrorState) -> ProcessNoise:
+def process_noise(body: RigidBody, settings: AttitudeFilterSettings, layout: ErrorState) -> ProcessNoise:
     """Return the process noise of `body` for the error state `layout`."""
     return ProcessNoise(
         settings.current_noise**2 * settings.control_period,
@@ -312,7 +312,7 @@ def process_noise(body: RigidBody, settings: FilterSettings, layout: ErrorState)
     )
 
 
-def slow_prior(body: RigidBody, settings: FilterSettings) -> SlowPrior:
+def slow_prior(body: RigidBody, settings: AttitudeFilterSettings) -> SlowPrior:
     """Return the prior of the slowly varying states before any measurement."""
     thread = (settings.torsion_start**2, settings.damping_start**2) if body.suspended else (0.0, 0.0)
     return SlowPrior(
@@ -397,7 +397,9 @@ class AttitudeFilter:
     This number of rejections is small, because a wrong initial state should be discarded early.
     """
 
-    def __init__(self, body: RigidBody, settings: FilterSettings, prior: SlowPrior | None = None) -> None:
+    def __init__(
+        self, body: RigidBody, settings: AttitudeFilterSettings, prior: SlowPrior | None = None
+    ) -> None:
         """Create a filter that has not started.
 
         By default, and after each restart, the prior of the slowly varying states follows from the settings.

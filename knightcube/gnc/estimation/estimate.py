@@ -106,7 +106,10 @@ class AttitudeMeasurement(_AtOneTime):
 
 @dataclass(frozen=True, slots=True, eq=False)
 class RateMeasurement(_AtOneTime):
-    """A body rate (3,), rad/s, measured by a gyro and including the gyro bias, with covariance (3, 3)."""
+    """A body rate (3,), rad/s, measured by a gyro and including the gyro bias, with covariance (3, 3).
+
+    The filter estimates the bias, so the covariance is that of the gyro's white noise only.
+    """
 
     time_ns: int
     rate: FloatArray
@@ -241,7 +244,8 @@ class Estimate:
         bias: gyro bias (3,) in body axes, rad/s.
         disturbance: unmodelled angular acceleration (3,), rad/s^2.
         parameters: estimated torsion and damping of the thread, and gain of the coils.
-        covariance: covariance (19, 19) of the error state; the attitude error is a rotation in body axes.
+        covariance: covariance (19, 19) of the error state, in the order of `BLOCKS`: the first six elements
+            are attitude error and rate error. The attitude error is a rotation in body axes.
         measured_ns: time of the newest accepted measurement, ns.
         latency: age of the inertial unit's samples (delay between measurement and time stamp), s.
         field_bias: magnetometer bias (3,) in body axes, T.

@@ -39,7 +39,7 @@ from knightcube.astro.arrays import (
 )
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.geomagnetism import check_year
-from knightcube.astro.earth.orbit_knowledge import elements_of
+from knightcube.astro.earth.orbit_knowledge import TwoLineElements, elements_of
 from knightcube.astro.earth.orientation import julian_epoch
 from knightcube.astro.earth.sun import DAY, julian_date
 from knightcube.astro.inertia import inertia_problem
@@ -552,7 +552,7 @@ def _craft(inertia: ArrayLike, dipole_limit: ArrayLike, heat: ArrayLike) -> Slew
     return SlewCraft(tensor, finite_array("dipole_limit", dipole_limit, (3,)), weights)
 
 
-def _axes(pointing_axis: ArrayLike, across_axis: ArrayLike) -> BodyAxes:
+def body_axes(pointing_axis: ArrayLike, across_axis: ArrayLike) -> BodyAxes:
     """Return the body axes of the pointing targets. Raises ArgumentError if the axes are parallel."""
     axes = BodyAxes(unit_vector("pointing_axis", pointing_axis), unit_vector("across_axis", across_axis))
     if float(np.linalg.norm(np.cross(axes.pointing, axes.across))) < MINIMUM_SINE:
@@ -572,13 +572,8 @@ def _cone_angles(cones: Mapping[Literal["sun", "earth", "moon"], float] | None) 
 
 def _check_order(order: SlewOrder) -> None:
     """Raise UsageError or PlanningError, with the name of the argument of `plan_slew`, for invalid values."""
-    for name, target in (("start", order.start), ("goal", order.goal)):
-        if not isinstance(target, PointingTarget):
-            raise ArgumentError(name, f"{brief(target)}: give a PointingTarget, as PointingTarget(Goal.SUN)")
-        if target.goal is Goal.OBJECT:
-            raise UsageError(
-                "the direction of an object is known only in flight: no slew to it can be planned"
-            )
+    check_target("start", order.start)
+    check_target("goal", order.goal)
     for name, angle in order.angles.items():
         if name not in ("sun", "earth", "moon"):
             raise ArgumentError("cones", f"unknown exclusion cone {brief(name)}: give sun, earth or moon")
@@ -600,6 +595,14 @@ def _check_order(order: SlewOrder) -> None:
     _check_window(order.window)
 
 
+def check_target(name: str, target: PointingTarget) -> None:
+    """Raise ArgumentError unless the argument `name` is a target with a predictable direction."""
+    if not isinstance(target, PointingTarget):
+        raise ArgumentError(name, f"{brief(target)}: give a PointingTarget, as PointingTarget(Goal.SUN)")
+    if target.goal is Goal.OBJECT:
+        raise ArgumentError(name, "the direction of an object is known only in flight: give another goal")
+
+
 def _check_window(window: float) -> None:
     """Raise UsageError for a time window (s) out of range."""
     low, high = WINDOW_RANGE
@@ -610,16 +613,25 @@ def _check_window(window: float) -> None:
 def _ephemeris(elements: tuple[str, str], time: datetime, duration: float) -> Ephemeris:
     """Return the ephemeris for slews that begin at `time` and end at most `duration` s later.
 
-    The ephemeris begins `LEAD` s before `time`, and ends at least `LEAD` s after the last slew. Raises
-    UsageError for invalid elements, OrbitError if the epoch of the elements is too far from these times, and
-    GeomagneticError outside the years of the magnetic field model.
+    The ephemeris begins `LEAD` s before `time`, and ends at least `LEAD` s after the last slew. Raises the
+    errors of `known_orbit`.
     """
-    dates, satellite = julian_date(time) + np.array([0.0, duration / DAY]), elements_of(elements)
+    begin = timedelta(seconds=LEAD)
+    return predict(known_orbit(elements, time, duration).at(julian_date(time - begin)), duration + 3.0 * LEAD)
+
+
+def known_orbit(elements: tuple[str, str], time: datetime, duration: float) -> TwoLineElements:
+    """Return the orbit of two-line elements, which is known from `time` until `duration` s later.
+
+    Raises UsageError for invalid elements, OrbitError if the epoch of the elements is too far from these
+    times, and GeomagneticError outside the years of the magnetic field model.
+    """
+    dates, orbit = julian_date(time) + np.array([0.0, duration / DAY]), elements_of(elements)
     for year in julian_epoch(dates).tolist():
         check_year(year)
     for date in dates.tolist():
-        satellite.known_at(date)
-    return predict(satellite.at(julian_date(time - timedelta(seconds=LEAD))), duration + 3.0 * LEAD)
+        orbit.known_at(date)
+    return orbit
 
 
 def plan_slew(
@@ -684,7 +696,7 @@ def plan_slew(
     optional = {"longest": longest, "time_cost": time_cost}
     given = {name: value for name, value in optional.items() if value is not None}
     check_numbers(duration=duration, window=window, **given)
-    axes = _axes(pointing_axis, across_axis)
+    axes = body_axes(pointing_axis, across_axis)
     order = SlewOrder(
         _craft(inertia, dipole_limit, heat),
         axes,

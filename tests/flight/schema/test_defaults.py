@@ -34,7 +34,7 @@ SERVES: dict[str, tuple[type[msgspec.Struct], ...]] = {
     "ExcitationSettings": (bodies.Identification,),
     "FieldDetumblerSettings": (bodies.FieldDetumble,),
     "FieldRateSettings": (bodies.FieldDetumble, bodies.Craft),
-    "FilterSettings": (bodies.ThreadEstimation,),
+    "AttitudeFilterSettings": (bodies.ThreadEstimation,),
     "ImagingSettings": OF_CAMERA,
     "LikelihoodSettings": OF_CAMERA,
     "NavigationSettings": (devices.InertialUnitSection, sections.Estimation),

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import math
 from dataclasses import replace
+from datetime import UTC, datetime, timedelta
 from typing import Any
 
 import numpy as np
 import pytest
 
+from knightcube import Goal, PointingTarget, plan_pointing, propagate_elements
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.disturbance import AIR, CONSTANT, SIZES, pressures, shapes
+from knightcube.astro.earth.orbit_knowledge import OrbitError
 from knightcube.astro.quaternion import angle_between, attitude_matrix, from_rotation_vector, multiply
 from knightcube.errors import ArgumentError, PlanningError, UsageError
 from knightcube.gnc.control.pointing_law import (
@@ -261,3 +264,58 @@ def test_the_damping_in_a_field_of_zero_is_zero_and_values_that_are_not_finite_a
     for name, given in (("rate", (math.nan * rate, field)), ("field", (rate, math.nan * field))):
         with pytest.raises(ArgumentError, match=name):
             damping_dipole(inertia, *given)
+
+
+ELEMENTS = (
+    "1 99999U 26001A   26079.50000000  .00000000  00000-0  00000+0 0    05",
+    "2 99999  97.4640 337.4170 0011973 295.7805  64.3547 15.24067411    09",
+)
+
+
+def test_a_law_that_is_planned_for_elements_begins_at_the_motion_and_approaches_the_target() -> None:
+    """The direction to the Earth is that of SGP4, through the public function for elements."""
+    start, begin = from_rotation_vector(np.array([0.4, -0.3, 0.2])), datetime(2026, 3, 20, 12, 10, tzinfo=UTC)
+    law = plan_pointing(
+        inertia=[1.1e-3, 1.05e-3, 0.99e-3],
+        dipole_limit=[0.1, 0.1, 0.1],
+        elements=ELEMENTS,
+        time=begin,
+        target=PointingTarget(Goal.NADIR),
+        quaternion=start,
+        rate=[1e-3, 0.0, 0.0],
+        weights=WEIGHTS,
+    )
+    first, last = law.span
+    turned = multiply(from_rotation_vector(first * np.array([1e-3, 0.0, 0.0])), start)
+    assert float(angle_between(law.reference(first).quaternion, turned)) < 1e-6
+    positions, _ = propagate_elements(ELEMENTS, [begin + timedelta(seconds=s) for s in (first, last)])
+    off = [
+        math.acos(-float(attitude_matrix(law.reference(s).quaternion)[2] @ p) / float(np.linalg.norm(p)))
+        for s, p in zip((first, last), positions, strict=True)
+    ]
+    assert off[1] < 0.05 < 0.2 * off[0]
+    field = np.array([2e-5, 0.0, 3e-5])
+    command = law.command(first, turned, np.array([1e-3, 0.0, 0.0]), field)
+    given = law.command(first, turned, np.array([1e-3, 0.0, 0.0]), field, np.zeros(3), np.zeros(9))
+    np.testing.assert_array_equal(command.dipole, given.dipole)
+
+
+@pytest.mark.parametrize(
+    ("changed", "error", "text"),
+    [
+        ({"dipole_limit": [0.1, 0.1, 0.0]}, ArgumentError, "dipole_limit: .*above zero"),
+        ({"inertia": [1e-3, 1e-3, 3e-3]}, ArgumentError, "inertia: .*principal moments"),
+        ({"quaternion": [0, 0, 0, 2]}, ArgumentError, "quaternion: .*length 1"),
+        ({"target": PointingTarget(Goal.OBJECT)}, ArgumentError, "target: .*only in flight"),
+        ({"across_axis": (0.0, 0.0, 2.0)}, ArgumentError, "across_axis: .*parallel"),
+        ({"time": datetime(2027, 3, 20, tzinfo=UTC)}, OrbitError, "days"),
+    ],
+)
+def test_a_law_for_impossible_arguments_is_refused(changed: Any, error: type[Exception], text: str) -> None:
+    given: dict[str, Any] = {
+        "inertia": INERTIA, "dipole_limit": [0.1] * 3, "elements": ELEMENTS,
+        "time": datetime(2026, 3, 20, tzinfo=UTC), "target": PointingTarget(Goal.SUN),
+        "quaternion": [0, 0, 0, 1], "rate": [0, 0, 0], "weights": WEIGHTS,
+    }  # fmt: skip
+    with pytest.raises(error, match=text):
+        plan_pointing(**given | changed)

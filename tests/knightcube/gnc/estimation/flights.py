@@ -10,7 +10,7 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import from_rotation_vector, multiply
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, AttitudeFilterSettings
 from knightcube.gnc.estimation.estimate import AttitudeMeasurement, Parameters, RateMeasurement
 from knightcube.gnc.estimation.rigid_body import RigidBody
 from tests.support.consistency_worlds import (
@@ -87,7 +87,7 @@ def fly(
     return flight
 
 
-def begin(flight: Flight, suspended: bool, settings: FilterSettings = SETTINGS) -> AttitudeFilter:
+def begin(flight: Flight, suspended: bool, settings: AttitudeFilterSettings = SETTINGS) -> AttitudeFilter:
     """Return a filter that starts on the first sample of a flight."""
     filter_ = AttitudeFilter(SUSPENDED if suspended else FREE, settings)
     filter_.start(*flight.samples[0])

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from knightcube.astro.quaternion import angle_about_axis_y, exponential
-from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, FilterSettings
+from knightcube.gnc.estimation.attitude_filter import AttitudeFilter, AttitudeFilterSettings
 from knightcube.gnc.estimation.estimate import LATENCY, Estimate, FilterState, Parameters, RateMeasurement
 from knightcube.gnc.estimation.mekf import LONGEST_LATENCY
 from knightcube.gnc.estimation.rigid_body import rate_change
@@ -20,7 +20,9 @@ SWING = 0.14
 ESTIMATING = replace(SETTINGS, latency_start=0.05)
 
 
-def follow_late(flight: Flight, late: int, settings: FilterSettings) -> tuple[AttitudeFilter, Estimate]:
+def follow_late(
+    flight: Flight, late: int, settings: AttitudeFilterSettings
+) -> tuple[AttitudeFilter, Estimate]:
     """Give a filter samples whose time stamps are `late` cycles late; return filter and last estimate."""
     filter_ = AttitudeFilter(SUSPENDED, settings)
     for cycle in range(late, len(flight.samples)):
