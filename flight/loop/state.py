@@ -73,8 +73,8 @@ REMEMBERED = 32
 """Maximum number of unclean shutdowns in the stored state."""
 
 
-class StatePart(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
-    """Base class of the stored types, which reject unknown keys."""
+class StatePart(msgspec.Struct, frozen=True):
+    """Base class of the stored types. Unknown keys, which a later release has written, are ignored."""
 
 
 class Learned(StatePart, frozen=True):
@@ -401,7 +401,7 @@ Report = Callable[[EventKind, str], None]
 """Function that reports an event, given its kind and text."""
 
 
-class _StateCopy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _StateCopy(msgspec.Struct, frozen=True):
     """JSON content of one copy of the state."""
 
     generation: Annotated[int, Meta(ge=1, le=2**62)]

@@ -268,7 +268,7 @@ class TimetableError(KnightCubeError):
     """Raised if a schedule entry cannot be added, found or removed. The error text states the reason."""
 
 
-class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Entry(msgspec.Struct, frozen=True):
     """Schedule entry, numbered from 1: a command in words, due at the UTC `at_ns` (ns since 1970).
 
     The values `spi` and `counter` come from the frame that contained the scheduling command.
@@ -281,7 +281,7 @@ class Entry(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     command: Annotated[str, Meta(max_length=LONGEST_COMMAND)]
 
 
-class _Copy(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _Copy(msgspec.Struct, frozen=True):
     """Stored copy of the schedule with the last entry number; the copy with the higher version is used."""
 
     version: _Count = 0

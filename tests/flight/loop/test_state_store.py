@@ -217,7 +217,6 @@ def _with_crc(text: str) -> bytes:
         ("learned", {"x": {"values": [1.0, 2.0], "covariance": [[1.0, 0.0]]}}),
         ("learned", {"x": {"values": [1.0, 2.0], "covariance": [[1.0, 0.5], [0.4, 1.0]]}}),
         ("learned", {"x": {"values": [None], "covariance": [[1.0]]}}),
-        ("unknown", 1),
     ],
 )
 def test_a_wrong_content_with_a_valid_checksum_is_refused(key: str, value: object) -> None:
@@ -226,6 +225,14 @@ def test_a_wrong_content_with_a_valid_checksum_is_refused(key: str, value: objec
     good["state"][key] = value
     with pytest.raises(ValueError, match=r"\w"):
         decode(_with_crc(json.dumps(good)))
+
+
+def test_keys_that_a_later_release_has_added_are_ignored() -> None:
+    """After a return to an earlier release, this release must not lose the state of the later one."""
+    copy = json.loads(encode(1, state_of(1)).partition(b"\n")[0])
+    for part in (copy, copy["state"], *copy["state"]["learned"].values(), *copy["state"]["unclean"]):
+        part["added"] = {"later": [1]}
+    assert decode(_with_crc(json.dumps(copy))).state == state_of(1)
 
 
 @pytest.mark.parametrize("bad", [float("nan"), float("inf")])

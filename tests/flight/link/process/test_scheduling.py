@@ -5,6 +5,7 @@ Late commands are reported and not run.
 
 from __future__ import annotations
 
+import json
 import math
 from collections.abc import Iterator
 from datetime import UTC, datetime, timedelta
@@ -24,7 +25,7 @@ from flight.link.commands import (
     words_of,
 )
 from flight.link.events import FOREIGN_MODES, Mode
-from flight.link.files.store import overwrite
+from flight.link.files.store import line_of, overwrite, to_record
 from flight.link.process import commanding, directives
 from flight.link.process.commanding import (
     AT_MOST,
@@ -264,6 +265,19 @@ def test_an_entry_whose_removal_reached_one_copy_is_not_there_after_a_failed_wri
     )
     table.remove(1)
     assert Timetable(tmp_path).entries == ()
+
+
+def test_fields_that_a_later_release_has_added_to_the_schedule_are_ignored(tmp_path: Path) -> None:
+    """After a return to an earlier release, the commands that were scheduled before are executed."""
+    table = Timetable(tmp_path)
+    entry = table.add(5, 1, 9, "ping 1")
+    for path in tmp_path.glob("schedule.*"):
+        values = json.loads(line_of(path.read_bytes()) or b"")
+        for part in (values, *values["entries"]):
+            part["added"] = 1
+        path.write_bytes(to_record(json.dumps(values).encode()))
+    again = Timetable(tmp_path)
+    assert (again.lost, again.entries) == (False, (entry,))
 
 
 def test_a_lost_schedule_is_reported_and_a_full_disk_refuses(
