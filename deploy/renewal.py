@@ -494,6 +494,7 @@ class Renewal:
             self._judge()
         if self._state.trial is None or self._state.trial.stage != "install":
             shutil.rmtree(self._board.own / "staging", ignore_errors=True)
+        self._remove_failed()
         self._count_silence()
         self._age_note()
         self._save()
@@ -603,6 +604,8 @@ class Renewal:
         if kind == "release":
             # If the current release is incomplete, the previous release runs, also after a failed trial.
             old, new, what = board.release("current") or board.release("previous"), "", "release"
+            (staging / "artefact").unlink()  # the check of the built release needs the space
+            shutil.rmtree(staging / "unpacked")
             os.sync()  # the sources must be on disk before the trial is stored
         else:
             old, what = board.keep(""), "configuration"
@@ -737,7 +740,7 @@ class Renewal:
         name = done.stdout.split()[-1]
         try:
             self._check_built(name)
-        except Refused:
+        except (Refused, OSError):
             with suppress(OSError):  # a release in use was not built again, and is kept
                 if name not in {board.linked("current"), board.linked("previous")}:
                     board.remove(name)
@@ -790,6 +793,8 @@ class Renewal:
         if trial.what == "configuration" or trial.new:  # without a built release, no restart is necessary
             board.restart()  # if killed before the state is stored, this step is repeated
         self._save()
+        with suppress(OSError):
+            self._tidy_kept()
 
     def _judge(self) -> None:
         """End the trial if the new version fails, or if the ground has not confirmed it in time."""
@@ -891,20 +896,37 @@ class Renewal:
             if state.note_s >= FIRST_CONTACT_S + self._elapsed:
                 state.note = ""
 
+    def _remove_failed(self) -> None:
+        """Remove the releases that failed a trial, except the newest one.
+
+        The script `fly` starts the newest one if all other releases are damaged.
+        """
+        board, releases = self._board, self._board.prefix / "releases"
+        with suppress(OSError):
+            if failed := [name for name in self._state.bad if (releases / name).is_dir()][:-1]:
+                used = {board.linked("current"), board.linked("previous")}
+                for name in {*failed} - used - {*map(board.flown_release, (FLIGHT, LINK))}:
+                    board.remove(name)
+
     def _tidy(self) -> None:
         """Remove releases and configurations that are no longer needed."""
-        state, board = self._state, self._board
+        board = self._board
         with suppress(OSError):
             named_releases = {board.linked("current"), board.linked("previous")}
             for path in (board.prefix / "releases").iterdir():
                 if path.name not in named_releases:
                     board.remove(path.name)
-            texts = [(board.kept / name / CONFIGURATION) for name in (state.previous, GROUND)]
-            named = b"".join(path.read_bytes() for path in (*texts, board.configuration) if path.is_file())
-            for path in board.kept.iterdir():
-                is_index = path.name.startswith("index-") and path.name.encode() in named
-                if not is_index and path.name not in {state.previous, GROUND}:
-                    shutil.rmtree(path) if path.is_dir() else path.unlink()
+            self._tidy_kept()
+
+    def _tidy_kept(self) -> None:
+        """Remove stored configurations and catalogues that are no longer needed. Raises OSError."""
+        state, board = self._state, self._board
+        texts = [(board.kept / name / CONFIGURATION) for name in (state.previous, GROUND)]
+        named = b"".join(path.read_bytes() for path in (*texts, board.configuration) if path.is_file())
+        for path in board.kept.iterdir():
+            is_index = path.name.startswith("index-") and path.name.encode() in named
+            if not is_index and path.name not in {state.previous, GROUND}:
+                shutil.rmtree(path) if path.is_dir() else path.unlink()
 
 
 def boot_id() -> str:

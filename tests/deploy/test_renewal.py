@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import io
 import json
 import shutil
@@ -439,6 +440,29 @@ def test_a_release_that_cannot_open_bundles_is_refused(board: RenewedBoard) -> N
     assert [path.name for path in (board.files.prefix / "releases").iterdir()] == [FIRST]
 
 
+def test_a_release_that_cannot_be_checked_on_a_full_disk_leaves_no_files(board: RenewedBoard) -> None:
+    request = board.activate(board.bundle("release", board.source("new"), 1), "release")
+    full = OSError(errno.ENOSPC, "No space left on device")
+    with patch.object(renewal.Renewal, "_check_built", side_effect=full):
+        board.step()
+    assert "No space left on device" in board.reports(request)[-1][1]
+    assert [path.name for path in (board.files.prefix / "releases").iterdir()] == [FIRST]
+
+
+def test_the_check_of_a_built_release_has_the_space_of_its_unpacked_bundle(board: RenewedBoard) -> None:
+    check, found = renewal.Renewal._check_built, list[str]()
+
+    def checked(renewing: Any, name: str) -> None:
+        found.extend(path.name for path in (board.own / "staging").iterdir())
+        check(renewing, name)
+
+    board.activate(board.bundle("release", board.source("new"), 1), "release")
+    with patch.object(renewal.Renewal, "_check_built", checked):
+        board.step()
+    assert board.release() == "new"
+    assert sorted(found) == ["bundle", "source"]
+
+
 def test_a_release_is_not_built_from_damaged_packages(board: RenewedBoard) -> None:
     (library,) = (board.files.prefix / "current").glob("venv/lib/python3*/site-packages/numpy/numpy.py")
     library.write_text(library.read_text(encoding="ascii").upper(), encoding="ascii")
@@ -526,6 +550,31 @@ def test_damaged_trusted_metadata_do_not_prevent_a_renewal(board: RenewedBoard, 
         data[len(data) // 2] ^= 1
         path.unlink() if damage == "missing" else path.write_bytes(data if damage == "flip" else b"")
     activated(board, "third", 2)
+
+
+def test_releases_that_fail_their_trials_do_not_fill_the_disk(board: RenewedBoard) -> None:
+    """The newest one stays, because the script `fly` starts it if all other releases are damaged."""
+    releases = board.files.prefix / "releases"
+    for number, label in enumerate(("one", "two", "three"), start=1):
+        board.activate(board.bundle("release", board.source(label), number), "release")
+        board.step()
+        board.request("withdraw", "release")
+        board.step()
+        board.step()
+        labels = {(path / "label").read_text(encoding="ascii") for path in releases.glob("*/venv")}
+        assert labels == {"old", label}
+
+
+def test_a_catalogue_that_fails_its_trial_does_not_stay_on_the_disk(board: RenewedBoard) -> None:
+    kept = board.own / "kept"
+    activated(board)
+    (kept / "index-0").write_bytes(b"catalogue")
+    board.request("withdraw")
+    board.step()
+    assert {path.name for path in kept.iterdir()} <= {
+        "ground",
+        decoded((board.own / "state.a").read_bytes())["previous"],
+    }
 
 
 def test_a_release_that_fails_its_trial_is_never_returned_to(board: RenewedBoard) -> None:
