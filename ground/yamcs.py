@@ -67,7 +67,7 @@ services:
 instances: [{instance}]
 buckets: [{buckets}]
 dataDir: {data}
-cacheDir: {data}/cache
+cacheDir: {cache}
 secretKey: {secret}
 """
 
@@ -132,7 +132,7 @@ dataLinks:
   - name: {recorded}
     class: org.yamcs.tctm.FilePollingTmDataLink
     stream: tm_realtime
-    incomingDir: {folder}/{recorded}
+    incomingDir: {incoming}
     deleteAfterImport: true
     packetInputStreamClassName: org.yamcs.tctm.CcsdsPacketInputStream
     packetInputStreamArgs: {{maxPacketLength: 65542}}
@@ -140,7 +140,7 @@ dataLinks:
     packetPreprocessorArgs: *packets
 mdb:
   - type: xtce
-    args: {{file: {folder}/{instance}.xml}}
+    args: {{file: {database}}}
 streamConfig:
   tm: [{{name: tm_realtime, processor: realtime}}]
   invalidTm: invalid_tm_stream
@@ -150,7 +150,7 @@ streamConfig:
   parameterAlarm: [alarms_realtime]
   eventAlarm: [event_alarms_realtime]
   tc: [{{name: tc_realtime, processor: realtime}}]
-  sqlFile: {folder}/etc/files.sql
+  sqlFile: {sql}
 """
 
 LINK_SOURCE = "GatewayLink.java"
@@ -236,19 +236,20 @@ def files(
         host=_LOOPBACK,
         http=http_port,
         instance=INSTANCE,
-        data=folder / "data",
-        folder=folder,
+        data=_quoted(folder / "data"),
+        cache=_quoted(folder / "data/cache"),
         secret=secrets.token_hex(_SECRET_BYTES),
-        buckets=", ".join(f"{{name: {name}, path: {folder}/{name}}}" for name in _BUCKETS),
+        buckets=", ".join(f"{{name: {name}, path: {_quoted(folder / name)}}}" for name in _BUCKETS),
     )
     instance = _INSTANCE.format(
         live=str(gateway is not None).lower(),
         recorded=RECORDED,
         gateway_host=host,
         gateway_port=port,
-        token=token_path(keys.absolute(), port),
-        folder=folder,
-        instance=INSTANCE,
+        token=_quoted(token_path(keys.absolute(), port)),
+        incoming=_quoted(folder / RECORDED),
+        database=_quoted(folder / f"{INSTANCE}.xml"),
+        sql=_quoted(folder / "etc/files.sql"),
         epoch=epoch,
         cfdp=CFDP,
         pdu_bytes=min(SEGMENT_BYTES, command_frame_bytes - FRAME_OVERHEAD_BYTES - UNIT_OVERHEAD_BYTES),
@@ -268,6 +269,11 @@ def files(
         f"{INSTANCE}.xml": document(commands=layouts_for(body, TELECOMMANDS), epoch=epoch, verified=True),
         **stacks_and_displays(body),
     }
+
+
+def _quoted(path: Path) -> str:
+    """Return a path as a YAML string in double quotes, because a path may contain `: `, ` #` or braces."""
+    return json.dumps(str(path), ensure_ascii=False)
 
 
 def write(

@@ -13,6 +13,7 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 import pytest
+import yaml
 
 from flight.app.cli import main as command_line_main
 from flight.link.telemetry.definitions import HEALTH
@@ -47,6 +48,22 @@ def test_the_command_writes_the_whole_configuration(tmp_path: Path, monkeypatch:
     written = {str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*") if path.is_file()}
     assert written == set(files(tmp_path, "127.0.0.1:1", 1, "2026-11-23T12:00:00"))
     assert {path.stat().st_mode & 0o077 for path in tmp_path.rglob("*") if path.is_file()} == {0}, "passwords"
+
+
+@pytest.mark.parametrize(
+    "name", ["a b", "my: file", "a #b", "{curly}, [square]", 'quoted "x" \\', "häuschen"]
+)
+def test_any_path_is_a_string_of_the_configuration(tmp_path: Path, name: str) -> None:
+    folder = tmp_path / name
+    contents = files(folder, None, 1, "2026-11-23T12:00:00", folder / "keys")
+    server, instance = (yaml.safe_load(contents[f"etc/yamcs{part}.yaml"]) for part in ("", f".{INSTANCE}"))
+    assert (server["dataDir"], server["cacheDir"]) == (str(folder / "data"), str(folder / "data/cache"))
+    assert [Path(bucket["path"]).parent for bucket in server["buckets"]] == [folder] * 4
+    gateway, recorded = instance["dataLinks"]
+    assert Path(gateway["tokenFile"]).parent == folder / "keys"
+    assert recorded["incomingDir"] == str(folder / RECORDED)
+    assert instance["mdb"][0]["args"]["file"] == str(folder / f"{INSTANCE}.xml")
+    assert instance["streamConfig"]["sqlFile"] == str(folder / "etc/files.sql")
 
 
 def test_stacks_and_displays_name_commands_arguments_and_parameters_of_the_tables() -> None:
