@@ -20,8 +20,8 @@ import termios
 import threading
 from array import array
 from collections import deque
-from collections.abc import Callable, Sequence
-from contextlib import ExitStack, suppress
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager, suppress
 from fcntl import LOCK_EX, LOCK_NB, flock, ioctl
 from pathlib import Path
 from struct import Struct, pack
@@ -65,8 +65,8 @@ class PySerialPort:
         """Open the port.
 
         Raises NotResponding if the port cannot be opened. If `patient` is true, a missing port counts as
-        lost instead, and is opened later. A call of `send` takes at most `write_timeout`, s; the default is
-        short enough for the thread that drives the coils.
+        lost instead, and is opened later. A call of `send` waits at most `write_timeout`, s, for the port and
+        as long for its output queue; the default is short enough for the thread that drives the coils.
         """
         self.baud_rate = baud_rate
         self.lost_bytes = 0
@@ -112,7 +112,7 @@ class PySerialPort:
         if self._failure:
             raise NotResponding(self._device, self._failure)
         try:
-            with self._port_lock:
+            with self._held():
                 written = self._write(data)
         except _PORT_ERRORS as error:
             message = f"writing failed ({error}): is the device still there?"
@@ -125,7 +125,7 @@ class PySerialPort:
         # The baud rate is stored even if the port is lost, because the port is reopened at this rate.
         self.baud_rate = baud_rate
         try:
-            with self._port_lock:
+            with self._held():
                 self._serial.baudrate = baud_rate
         except _PORT_ERRORS as error:
             raise NotResponding(self._device, f"does not support {baud_rate} baud ({error})") from error
@@ -145,6 +145,19 @@ class PySerialPort:
         self._thread.join(timeout=2.0)
         self._serial.close()
         self._failure = self._failure or "the port was closed"
+
+    @contextmanager
+    def _held(self) -> Iterator[None]:
+        """Hold the lock of the port. Raises NotResponding while the receiving thread closes a lost port.
+
+        Closing a port can take 30 s, because the kernel waits for the output queue.
+        """
+        if not self._port_lock.acquire(timeout=self._write_timeout):
+            raise NotResponding(self._device, "the lost port is being closed")
+        try:
+            yield
+        finally:
+            self._port_lock.release()
 
     def _write(self, data: bytes) -> int:
         """Write bytes, and wait while the output queue is full. Return the number of written bytes.

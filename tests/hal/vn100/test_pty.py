@@ -12,6 +12,7 @@ import termios
 import threading
 from collections.abc import Iterator
 from contextlib import ExitStack, suppress
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -287,6 +288,31 @@ def test_a_port_that_takes_no_bytes_costs_less_than_a_control_cycle_and_is_not_r
     os.close(near)
     port.close()
     os.close(far)
+
+
+def test_a_port_that_its_thread_closes_slowly_is_not_waited_for(
+    cable: Cable, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The kernel waits up to 30 s for the output queue of a serial port that is closed."""
+    port, closing, closed = cable.port, threading.Event(), threading.Event()
+    close = port._serial.close
+
+    def slowly() -> None:
+        closing.set()
+        assert closed.wait(10.0)
+        close()
+
+    monkeypatch.setattr(port._serial, "close", slowly)
+    cable.unplug()
+    assert closing.wait(10.0)
+    port._failure = ""  # the loss was not yet known when the caller checked it
+    for call in (partial(port.send, b"?"), partial(port.set_baud_rate, 57600)):
+        with pytest.raises(NotResponding, match="is being closed"):
+            call()
+    assert not closed.is_set()
+    closed.set()
+    assert port.baud_rate == 57600
+    cable.plug()
 
 
 class InterruptedClock(SystemClock):
