@@ -5,7 +5,8 @@ huge sparse file would exhaust the memory.
 
 The state of file transfers consists of open transfers, transaction numbers, ended transfers and received
 files. Each record is written to a temporary file, synced and renamed, so that a crash leaves the old or the
-new record. A record is a line of JSON, followed by a line with its CRC-32 in hexadecimal digits.
+new record. A record is a line of JSON, followed by a line with its CRC-32 in hexadecimal digits. Unknown
+fields of a record are ignored, so that an earlier release can read the records of a later release.
 """
 
 from __future__ import annotations
@@ -88,10 +89,16 @@ def make_lasting(folder: Path) -> None:
         os.close(names)
 
 
+_SYNCED: set[Path] = set()
+"""Files whose names this process has synced to disk. A killed process may have left a file whose name was not
+synced, so each process syncs the name at its first write."""
+
+
 def overwrite(path: Path, data: bytes) -> bool:
     """Overwrite a file in place and sync it to disk. Return whether the file was written."""
     try:
-        new = not path.exists()
+        if not path.exists():
+            _SYNCED.discard(path)
         # Without O_NONBLOCK, opening a FIFO at this path would block.
         file = os.open(path, os.O_WRONLY | os.O_CREAT | os.O_NONBLOCK | os.O_CLOEXEC, 0o600)
         try:
@@ -101,12 +108,9 @@ def overwrite(path: Path, data: bytes) -> bool:
             os.fsync(file)
         finally:
             os.close(file)
-        if new:
-            try:
-                make_lasting(path.parent)
-            except OSError:  # the next attempt must sync the folder again
-                path.unlink()
-                raise
+        if path not in _SYNCED:
+            make_lasting(path.parent)
+            _SYNCED.add(path)
     except OSError:
         return False
     return True
@@ -241,7 +245,7 @@ class Ranges:
         return found
 
 
-class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Outgoing(msgspec.Struct, frozen=True):
     """State of an outgoing transfer of file `path`, sent as `name`; `origin` identifies the command."""
 
     number: _Long
@@ -256,7 +260,7 @@ class Outgoing(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     suspended: bool = False
 
 
-class Incoming(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Incoming(msgspec.Struct, frozen=True):
     """Stored state of an incoming transfer: received metadata and EOF, byte ranges on disk, and result."""
 
     source: _Entity
@@ -270,7 +274,7 @@ class Incoming(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     suspended: bool = False
 
 
-class Ending(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class Ending(msgspec.Struct, frozen=True):
     """Result of an ended incoming transfer, stored to answer PDUs that the sender repeats."""
 
     source: _Entity
@@ -280,7 +284,7 @@ class Ending(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
     kept: int
 
 
-class _Numbers(msgspec.Struct, frozen=True, forbid_unknown_fields=True):
+class _Numbers(msgspec.Struct, frozen=True):
     last: _Long = 0
     endings: tuple[Ending, ...] = ()
 

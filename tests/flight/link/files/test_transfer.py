@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import io
+import json
 import os
 import zlib
 from collections.abc import Sequence
@@ -15,7 +16,17 @@ import numpy as np
 import pytest
 
 from flight.link.files import store
-from flight.link.files.store import FileError, Incoming, Outgoing, Ranges, Store, problem_of_name
+from flight.link.files.store import (
+    Ending,
+    FileError,
+    Incoming,
+    Outgoing,
+    Ranges,
+    Store,
+    line_of,
+    problem_of_name,
+    to_record,
+)
 from flight.link.files.transfer import (
     CRC32,
     CRC32C,
@@ -379,6 +390,29 @@ def test_a_damaged_record_is_ignored(tmp_path: Path, file: Path) -> None:
     for position in range(len(data)):
         path.write_bytes(data[:position] + bytes([data[position] ^ 1]) + data[position + 1 :])
         assert pair.store(SATELLITE).outgoing() == []
+
+
+def test_fields_that_a_later_release_has_added_to_records_are_ignored(tmp_path: Path) -> None:
+    """After a return to an earlier release, the transfers of the later release continue."""
+    folder, ending = Store(tmp_path), Ending(GROUND, 6, 0, complete=True, kept=2)
+    outgoing = Outgoing(7, GROUND, "/log", "log/a", 9, 1, CRC32)
+    incoming = Incoming(GROUND, 8, "elements/a", 4, ranges=((0, 2),))
+    for record in (outgoing, incoming):
+        folder.save(record)
+    folder.add_ending(ending)
+    folder.new_number(9 * 10**9)
+    for path in (tmp_path / "transfers").glob("*.json"):
+        values = json.loads(line_of(path.read_bytes()) or b"")
+        for part in (values, *values.get("endings", ())):
+            part["added"] = {"later": [1]}
+        path.write_bytes(to_record(json.dumps(values).encode()))
+    again = Store(tmp_path)
+    assert (again.outgoing(), again.incoming(), again.endings, again.last) == (
+        [outgoing],
+        [incoming],
+        (ending,),
+        9,
+    )
 
 
 def test_many_gaps_are_requested_in_order_and_a_bounded_number_at_a_time(tmp_path: Path) -> None:
@@ -853,6 +887,22 @@ def _opened(folder: Path) -> int:
         with suppress(FileNotFoundError):
             found += os.readlink(f"/proc/self/fd/{number}") == os.path.realpath(folder)
     return found
+
+
+def test_the_name_of_a_file_is_synced_again_after_the_start_of_a_process(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """An earlier process may have been killed between the creation of the file and the sync of its name."""
+    synced: list[Path] = []
+    monkeypatch.setattr(store, "make_lasting", synced.append)
+    path = tmp_path / "a"
+    path.write_bytes(b"zero")
+    assert store.overwrite(path, b"one")
+    assert store.overwrite(path, b"two")
+    assert synced == [tmp_path]
+    path.unlink()
+    assert store.overwrite(path, b"three")
+    assert synced == [tmp_path, tmp_path]
 
 
 def test_a_new_file_is_stored_only_if_its_folder_was_synced_to_disk(
