@@ -220,7 +220,7 @@ def _opened(kind: str, section: Any, rig: Rig, stack: ExitStack, key: str) -> An
     stack.callback(device.close)
     # The built-in drivers check their readings themselves, at less cost than `CheckedUnit`.
     if kind in {"inertial_unit", "magnetometer"} and ":" in section.driver:
-        return CheckedUnit(device, section.field_range)
+        return CheckedUnit(device, section.field_range, rig.clock)
     return device
 
 

@@ -42,6 +42,8 @@ LARGEST_RATE = math.radians(2000.0)
 """Default of the largest accepted body rate (rad/s) per axis, which is the range of common gyros."""
 _NORM_TOLERANCE = 1e-2
 """Largest accepted deviation of a quaternion's norm from 1."""
+_MOST_AHEAD_NS = SECOND_NS // 10
+"""Largest time (ns) by which the time of a reading may be ahead of the clock."""
 _RANGED = "gyro", "magnetic"
 _SHAPES = {"quaternion": (4,), "rate": (3,), "field": (3,), "acceleration": (3,)}
 _NO_RATE = np.full(3, math.nan)
@@ -268,13 +270,13 @@ class SensorUnit:
 class CheckedUnit:
     """Inertial unit whose readings are checked, because another team wrote its driver.
 
-    Readings with a value that is not finite or out of range are counted and omitted. If only the rate is out
-    of range, the rate of the reading is NaN. The value `field_range` is the largest accepted magnetic field
-    per axis, T.
+    Readings with a value that is not finite or out of range, or with a time in the future, are counted and
+    omitted. If only the rate is out of range, the rate of the reading is NaN. The value `field_range` is the
+    largest accepted magnetic field per axis, T.
     """
 
-    def __init__(self, unit: InertialUnit, field_range: float) -> None:
-        self._unit, self._field_range = unit, field_range
+    def __init__(self, unit: InertialUnit, field_range: float, clock: Clock) -> None:
+        self._unit, self._field_range, self._clock = unit, field_range, clock
         self._out_of_range = self._not_finite = 0
         self._rejection = ""
 
@@ -309,8 +311,10 @@ class CheckedUnit:
                 return None
         norm, field, rate = float(np.linalg.norm(values["quaternion"])), values["field"], values["rate"]
         shapes = {name: value.shape for name, value in values.items() if value.shape != _SHAPES[name]}
-        problem = ""
-        if shapes:
+        ahead_ns, problem = reading.time_ns - self._clock.now_ns(), ""
+        if not ahead_ns <= _MOST_AHEAD_NS:  # NaN compares false
+            problem = f"time_ns {ahead_ns / SECOND_NS:.6g} s ahead of the clock"
+        elif shapes:
             problem = ", ".join(f"{name} of shape {shape}" for name, shape in shapes.items())
         elif abs(norm - 1.0) > _NORM_TOLERANCE:
             problem = f"quaternion of norm {norm:.3g}, not 1"

@@ -217,12 +217,15 @@ class ForeignUnit:
         ({"field": np.zeros(4)}, (2, 2), "field of shape (4,)"),
         ({"field": np.array([0.0, 45.0, 0.0])}, (2, 2), "field [0.0, 45.0, 0.0] T, beyond 0.0006 T"),
         ({"quaternion": np.array([0.0, 0.0, 0.0, 2.0])}, (2, 2), "quaternion of norm 2, not 1"),
+        ({"time_ns": 1_800_000_000 * 10**9}, (2, 2), "time_ns 1.8e+09 s ahead of the clock"),
+        ({"time_ns": 10**8 + 1}, (2, 2), "time_ns 0.1 s ahead of the clock"),
+        ({"time_ns": np.nan}, (2, 2), "time_ns nan s ahead of the clock"),
     ],
 )
 def test_implausible_readings_of_a_foreign_driver_are_counted_and_omitted(
     change: dict[str, Any], counted: tuple[int, int], says: str
 ) -> None:
-    unit = CheckedUnit(ForeignUnit({}, change, {"field": [1e-5, 0.0, 0.0]}), 6e-4)
+    unit = CheckedUnit(ForeignUnit({}, change, {"field": [1e-5, 0.0, 0.0]}), 6e-4, SimClock())
     assert unit.link() == ImuLink(60, 5, 0, 0, 1, 2, 9, "of the driver")
     first, last = unit.poll()
     assert first.has_rate
@@ -234,7 +237,7 @@ def test_implausible_readings_of_a_foreign_driver_are_counted_and_omitted(
 
 def test_a_rate_in_sensor_counts_is_out_of_range_and_not_used() -> None:
     foreign = ForeignUnit({"rate": np.array([310, -2, 7])}, {"rate": [1.0, np.nan, 0.0]}, {"rate": [1, 2, 3]})
-    unit = CheckedUnit(foreign, 6e-4)
+    unit = CheckedUnit(foreign, 6e-4, SimClock())
     unit.configure()
     in_counts, invalid, fast = unit.poll()
     assert foreign.configured
