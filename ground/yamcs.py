@@ -190,6 +190,7 @@ public class GatewayLink extends TcpTcTmDataLink {
 }
 """
 
+_HEADERS = HEADER_BYTES + SECONDARY_BYTES  # length of both headers of a packet, bytes
 _STREAMS = """\
 create stream cfdp_in as select substring(packet, {before}) as pdu from tm_realtime \
 where extract_short(packet, 0) = {down}
@@ -257,13 +258,12 @@ def files(
         satellite=SATELLITE,
         down=DOWN_BUCKET,
     )
-    before = HEADER_BYTES + SECONDARY_BYTES
     header = f"{UP:04X}C0000000{PACKET_VERSION:02X}" + "00" * (SECONDARY_BYTES - 1)
     return {
         "etc/yamcs.yaml": server,
         "etc/security.yaml": _SECURITY,
         USERS: f'{USER}: {{password: "{secrets.token_hex(_SECRET_BYTES)}", superuser: true}}\n',
-        "etc/files.sql": _STREAMS.format(before=before, down=DOWN, space=SPACE, header=header),
+        "etc/files.sql": _STREAMS.format(before=_HEADERS, down=DOWN, space=SPACE, header=header),
         f"etc/yamcs.{INSTANCE}.yaml": instance,
         "etc/processor.yaml": _PROCESSORS,
         f"{INSTANCE}.xml": document(commands=layouts_for(body, TELECOMMANDS), epoch=epoch, verified=True),
