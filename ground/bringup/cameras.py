@@ -10,7 +10,7 @@ import numpy as np
 
 from flight.schema.devices import Camera, WideCamera
 from ground.bringup.bench import Outcome, Session, StepSkipped
-from ground.bringup.diagnosis import UNRECOGNISED, Finding
+from ground.bringup.diagnosis import Finding
 from hal.interfaces.devices import Frame
 from knightcube.astro.arrays import BoolArray, FloatArray, Image
 from knightcube.vision.frame import LEAST_SIDE
@@ -175,7 +175,7 @@ def _no_light(dark: Outcome | None, pixels: Image, level: float, sources: int) -
     if same or dark is None:
         text = f"{sources} point sources; the level is that of a dark frame ({level:.0f} counts)"
         return Finding("camera", "lens cap on", text, "take the cap off, or point the camera at stars")
-    text = f"{sources} point sources at a level of {level:.0f} counts, {UNRECOGNISED}"
+    text = f"{sources} point sources at a level of {level:.0f} counts, cause unknown"
     return Finding("camera", "no sources", text, "focus the lens, and point the camera at stars or lamps")
 
 

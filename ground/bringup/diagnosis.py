@@ -288,7 +288,7 @@ def diagnose_axes(turns: Turns) -> AxesFound:
         elif own := [one for one in named if one.part == part]:
             findings += own
         elif name in axes and axes[name] is None:
-            text = f"its values during the rotations are {UNRECOGNISED}"
+            text = f"its axes, found by the rotations, are {UNRECOGNISED}"
             cure = "repeat the rotations by exactly 90 deg, away from iron"
             findings.append(Finding(part, "wrong axes", text, cure))
     found = {name: _nearest(matrix) for name, matrix in axes.items() if matrix is not None}
@@ -383,7 +383,7 @@ def _gyro_axes(measured: FloatArray, findings: list[Finding]) -> FloatArray | No
         findings.append(Finding(part, "wrong scale", text, cure))
     found = _orthogonal(measured / sizes[:, None], np.eye(3))
     if found is None:
-        text = f"the axes of its rates during the rotations are {UNRECOGNISED}"
+        text = f"the axes of its rates, found by the rotations, are {UNRECOGNISED}"
         findings.append(Finding(part, "wrong axes", text, "repeat the rotations about the requested axes"))
     return found
 
@@ -776,7 +776,8 @@ def _coil_findings(
         return [Finding(part, "intermittent", text, cure)]
     if state.misfit[j] >= state.askew:
         shown = ", ".join(f"{value:.2f}" for value in state.response[j] / np.linalg.norm(state.response[j]))
-        text = f"coil {name}: its field is {math.degrees(state.misfit[j]):.0f} deg off, along ({shown})"
+        degrees = math.degrees(state.misfit[j])
+        text = f"coil {name}: its field is {degrees:.0f} deg off the expected direction, along ({shown})"
         cure = "mount the coil as configured, or set its `axis`; remove iron and magnets"
         return [Finding(part, "wrong direction", text, cure)]
     found = []

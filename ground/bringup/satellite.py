@@ -248,7 +248,7 @@ def step_strings(session: Session) -> Outcome:
         lit[number] = _currents(session, strings, normal) - dark
     alike = normals @ normals.T > 0.99 * np.linalg.norm(normals, axis=1) ** 2
     if (lit == 0.0).all():
-        text = f"no current changes, whichever panel is lit ({1e3 * float(dark.max()):.0f} mA)"
+        text = f"no current changes when a panel is lit (largest {1e3 * float(dark.max()):.0f} mA)"
         findings.append(Finding("solar_strings", "stuck", text, "switch the converters off and on"))
         return Outcome(findings, {"currents": lit.tolist()})
     for number, row in enumerate(lit):

@@ -560,7 +560,7 @@ ASKEW_AXES = about(2, 30.0)
          "current without field", ""),
         ({"field": [1.0, -1.0, 1.0]}, "reversed", "coil y: its field is opposite"),
         ({"field": tilted(14.0)}, None, ""),
-        ({"field": tilted(16.0)}, "wrong direction", "coil y: its field is 16 deg off, along (0.00, "),
+        ({"field": tilted(16.0)}, "wrong direction", "16 deg off the expected direction, along (0.00, "),
         ({"field": tilted(24.0), "axes": ASKEW_AXES}, None, ""),
         ({"field": tilted(26.0), "axes": ASKEW_AXES}, "wrong direction", "26 deg off"),
         ({"absent": np.array([[0.0, 0.0], [0.0, 0.035], [0.0, 0.0]])}, None, ""),

@@ -200,7 +200,7 @@ COIL_WIRING = {
         coil_field([[0.7, 0.0, 0.0], [0.7, 1.0, 0.0], [0.0, 0.0, 1.0]]),
         "coils",
         ["coils.windings[0] wrong direction"],
-        says="45 deg off, along (0.71, 0.71",
+        says="45 deg off the expected direction, along (0.71, 0.71",
     ),
     "coils x and y in parallel on one bridge": Case(
         {
