@@ -288,7 +288,9 @@ def linux_rig(config: Config, stack: ExitStack, patient: bool) -> Rig:
     rig = real_rig(config, stack, patient, exclusive=True)
     off = driver_of("coils", config.coils).off(config.coils)
     if not off:
-        raise ConfigError("coils.driver", "gives no I2C writes (`off`) for the guardian to stop the coils")
+        raise ConfigError(
+            "coils.driver", "its `off` returns no I2C writes, by which the guardian stops the coils"
+        )
     bus = rig.wires.i2c()
     with suppress(DeviceError) if patient else nullcontext():
         for write in off:

@@ -471,7 +471,8 @@ def supervise(guardian: GuardianLine, clock: Clock, recorder: Recorder, stack: E
     coils = next((ticker for ticker in clock.tickers if ticker.name == COILS), None)
     if coils is None:
         raise ConfigError(
-            "coils.driver", f"runs no ticker {COILS!r}: its method `start` must start one (docs/extending)"
+            "coils.driver",
+            f"has started no ticker {COILS!r}: start it in its method `start` (docs/extending)",
         )
     overseer = ServiceManager(os.environ, os.getpid())
     stack.callback(overseer.close)
@@ -697,7 +698,7 @@ def requested_config(request: RunRequest, text: str | None = None) -> tuple[str,
     text = read_text(request.config_path) if text is None else text
     config = configuration.parse(text, str(request.config_path))
     if request.faults and config.simulation is None:
-        raise UsageError("--fault: this configuration has real devices, into which no fault can be injected")
+        raise UsageError("--fault: this configuration has real devices; faults need a section `simulation`")
     if request.faults:
         spoiled = corrupted_text(request, text)
         if spoiled != text:

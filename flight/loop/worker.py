@@ -237,7 +237,7 @@ def message_length(data: bytes | bytearray) -> int | None:
 
 def _framed(body: bytes, views: Sequence[memoryview], slab: mmap.mmap) -> bytes:
     if sum(view.nbytes for view in views) > len(slab):
-        raise KnightCubeError(f"a job's arrays exceed the {len(slab)} bytes that a worker's memory holds")
+        raise KnightCubeError(f"a job's arrays exceed the {len(slab)} bytes of a worker's memory")
     offset = 0
     for view in views:
         slab[offset : offset + view.nbytes] = view

@@ -230,12 +230,12 @@ def _check_units(craft: Craft, coils: Coils, refuse: Refuse) -> None:
         refuse("craft.inertia", f"has moments with a sum of {trace:.4g} kg m^2, but {limits}: give kg m^2")
     residual = math.hypot(*craft.residual_dipole)
     if residual > _MOST_RESIDUAL * heaviest:
-        limit = f"more than {_MOST_RESIDUAL * heaviest:.3g} A m^2, the most for {heaviest:.3g} kg"
+        limit = f"more than {_MOST_RESIDUAL * heaviest:.3g} A m^2, the maximum for {heaviest:.3g} kg"
         refuse("craft.residual_dipole", f"has {residual:.4g} A m^2, {limit}: give A m^2 instead of mA m^2")
     for index, coil in enumerate(coils.windings):
         dipole = coil.strength() * (coil.current_limit or coils.current_limit)
         if dipole > _MOST_DIPOLE * heaviest:
-            limit = f"more than {_MOST_DIPOLE * heaviest:.3g} A m^2, the most for {heaviest:.3g} kg"
+            limit = f"more than {_MOST_DIPOLE * heaviest:.3g} A m^2, the maximum for {heaviest:.3g} kg"
             cure = "give m^2 for `area` and `dipole_per_ampere`, and A for `current_limit`"
             refuse(f"coils.windings[{index}]", f"has a dipole moment of {dipole:.4g} A m^2, {limit}: {cure}")
 
@@ -259,8 +259,8 @@ def _check_orbit(config: OrbitConfig, refuse: Refuse) -> None:
         degrees = math.degrees(math.acos(cosine))
         refuse("pointing.across", f"is {degrees:.1f} deg from `pointing.axis`: must be 90 deg from it")
     if config.inertial_unit.field_range < _EARTH_FIELD:
-        problem = f"is {config.inertial_unit.field_range:g}: a satellite measures up to {_EARTH_FIELD:g} T"
-        refuse("inertial_unit.field_range", f"{problem}, the largest field of the Earth: give T")
+        problem = f"is {config.inertial_unit.field_range:g} T; the Earth's field reaches {_EARTH_FIELD:g} T"
+        refuse("inertial_unit.field_range", f"{problem}: give T")
     if config.camera is not None:
         _check_cones(config.camera, config.pointing.cones, refuse)
 
@@ -319,7 +319,7 @@ def _check_power(config: Config, power: Power, refuse: Refuse) -> None:
         order = f"{limits.critical:g}, {limits.very_low:g}, {limits.low:g}"
         refuse("power.low_battery", f"has {order} as critical, very_low and low: must be in rising order")
     if limits.low + limits.hysteresis > 1.0:
-        top = f"is {limits.low:g}: plus the hysteresis {limits.hysteresis:g}"
+        top = f"is {limits.low:g}: with the hysteresis of {limits.hysteresis:g}"
         refuse("power.low_battery.low", f"{top} it exceeds 1, the full charge: reduce the limit")
     if config.camera is not None and limits.camera_period < config.camera.period:
         period = f"is {limits.camera_period:g} s: must be at least `camera.period`"
@@ -379,8 +379,8 @@ def _check_addresses(config: Config, refuse: Refuse) -> None:
         if kind == "coils" and section.driver == "drv8830":
             last, greatest = section.address + len(section.windings) - 1, high - len(section.windings) + 1
             if last > high:
-                problem = f"is 0x{section.address:02x}: the coils use the addresses up to 0x{last:02x}"
-                cure = f"a drv8830 has at most 0x{high:02x}: give at most 0x{greatest:02x}"
+                problem = f"is 0x{section.address:02x}: its coils use the addresses up to 0x{last:02x}"
+                cure = f"the last address of a drv8830 is 0x{high:02x}: give at most 0x{greatest:02x}"
                 refuse(f"{key}.address", f"{problem}, but {cure}")
 
 

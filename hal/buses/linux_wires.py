@@ -316,7 +316,7 @@ class LinuxI2cBus:
         check_length(length)
         answer = self._transact(address, lambda bus: bus.read_i2c_block_data(address, register, length))
         if len(answer) != length:
-            raise OSError(errno.EIO, f"{len(answer)} bytes, not {length}, from 0x{address:02x}, {self.name}")
+            raise OSError(errno.EIO, f"0x{address:02x} on {self.name} sent {len(answer)} bytes, not {length}")
         return answer
 
     def write_i2c_block_data(self, address: int, register: int, values: Sequence[int]) -> None:

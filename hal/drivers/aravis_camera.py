@@ -217,7 +217,8 @@ class AravisCamera:
         region = camera.get_region()
         if (region[2], region[3]) != (columns, rows):
             raise Refused(
-                self.name, f"reads {region[2]} x {region[3]} pixels, not {columns} x {rows}: check its steps"
+                self.name,
+                f"reads {region[2]} x {region[3]} pixels, not {columns} x {rows}: give a supported size",
             )
 
     def _set_gain(self, aravis: Any, camera: Any) -> None:
@@ -234,7 +235,7 @@ class AravisCamera:
         camera.set_gain(gain)
         actual = camera.get_gain()
         if not abs(actual - gain) <= _GAIN_TOLERANCE * (high - low):
-            raise Refused(self.name, f"its gain is {actual:g} after {gain:g} was set: choose a possible gain")
+            raise Refused(self.name, f"its gain is {actual:g} after {gain:g} was set: give a supported gain")
 
     def _set_exposure(self, camera: Any, exposure_ns: int) -> None:
         camera.set_exposure_time(exposure_ns / _MICROSECOND_NS)

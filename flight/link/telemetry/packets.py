@@ -150,9 +150,7 @@ def compile_layouts(packets: Iterable[Packet]) -> dict[str, Layout]:
     for name, layout in layouts.items():
         apid = layout.packet.apid
         if (first := named.setdefault(apid, name)) != name:
-            raise TelemetryError(
-                f"packets {first} and {name} share the APID 0x{apid:x}: give one another APID"
-            )
+            raise TelemetryError(f"packets {first} and {name} share the APID 0x{apid:x}: change one APID")
         names = [field.name for field in layout.packet.fields]
         if len({*names, "time_ns"}) != len(names) + 1:
             raise TelemetryError(f"packet {name}: a field's name is used twice, or is 'time_ns'")

@@ -199,7 +199,10 @@ def test_heartbeats_pass_while_the_job_of_the_coils_is_served() -> None:
 
 def test_a_coil_driver_without_a_periodic_job_is_refused() -> None:
     clock = SimpleNamespace(tickers=[SimpleNamespace(name="imu")])
-    with ExitStack() as stack, pytest.raises(ConfigError, match=r"coils\.driver: runs no ticker 'coils'"):
+    with (
+        ExitStack() as stack,
+        pytest.raises(ConfigError, match=r"coils\.driver: has started no ticker 'coils'"),
+    ):
         service.supervise(cast(Any, None), cast(Any, clock), cast(Any, None), stack)
 
 

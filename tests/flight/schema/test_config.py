@@ -498,7 +498,7 @@ def test_a_mistake_in_the_coils_gets_one_line(wrong: str, complaint: str) -> Non
         (
             "field_range: 2.5e-4",
             "field_range: 1e-5",
-            "is 1e-05: .* 6.5e-05 T, the largest field",
+            "is 1e-05 T; .* 6.5e-05 T: give T",
         ),
         ("mass: 0.611", "residual_dipole: [5, 0, 0]\n  mass: 0.611", "has 5 A m.2, more than 0.305 A m.2"),
     ],
@@ -622,7 +622,7 @@ def test_a_magnetometer_beside_the_inertial_unit_is_checked_like_the_unit() -> N
 def test_bridges_of_which_the_last_has_no_address_are_refused() -> None:
     text = "extends: step_demo\ncoils: {driver: drv8830, address: 0x66}\n"
     assert reader.parse(text).coils.address == 0x66
-    with pytest.raises(ConfigError, match=r"is 0x67: the coils use .* up to 0x69, .*: give at most 0x66"):
+    with pytest.raises(ConfigError, match=r"is 0x67: its coils use .* up to 0x69, .*: give at most 0x66"):
         reader.parse(text.replace("0x66", "0x67"))
 
 

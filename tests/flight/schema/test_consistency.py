@@ -256,7 +256,7 @@ def test_the_cones_of_the_shipped_satellites_are_wider_than_the_baffle_of_the_si
         ("{battery: {capacity: 2.6}, bus_monitor: {address: 0x41}}", r"bus_monitor.address` is 0x41"),
         ("{battery: {capacity: 2.6}, bus_monitor: {address: 0x49}}", r"bus_monitor.address` is 0x49"),
         ("{battery: {capacity: 2.6}, low_battery: {critical: 0.35}}", r"has 0.35, 0.3, 0.4.* rising order"),
-        ("{battery: {capacity: 2.6}, low_battery: {low: 0.95}}", r"low_battery.low` is 0.95: plus the hyst"),
+        ("{battery: {capacity: 2.6}, low_battery: {low: 0.95}}", r"low_battery.low` is 0.95: with the hyst"),
         ("{battery: {capacity: 2.6}, low_battery: {camera_period: 4.0}}", r"camera_period` is 4 s: must be"),
     ],
 )
