@@ -167,7 +167,7 @@ def _result(future: Any, key: str, address: str) -> Any:
         raise CampaignError(f"the scheduler at {address} is lost") from error
     except distributed.KilledWorker as error:
         raise CampaignError(
-            f"case {key} terminated every worker that ran it, such as {error.last_worker}"
+            f"case {key}: every worker that ran it died, such as {error.last_worker}: check its memory"
         ) from error
     if result is None:
         raise CampaignError(

@@ -359,8 +359,8 @@ def _here(workers: int | None, campaign: Campaign, cases: Sequence[Case], out: P
                         if deaths[case.key] == _ATTEMPTS:
                             status = worker.process.exitcode
                             raise CampaignError(
-                                f"case {case.key} terminated {_ATTEMPTS} worker processes, "
-                                f"the last with status {status}"
+                                f"case {case.key}: {_ATTEMPTS} worker processes died, "
+                                f"the last with status {status}: check the memory"
                             ) from lost
                         waiting.appendleft(case)
                         continue

@@ -39,7 +39,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     add("--duration", type=positive, metavar="S", help="duration of each flight")
     add("--only", default="", metavar="TEXT", help="run only flights with this text in their name")
     add("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
-    add("--workers", type=count, metavar="N", help="processes (default: the cores)")
+    add("--workers", type=count, metavar="N", help="processes (default: number of cores)")
     add("--dask", metavar="ADDRESS", help="scheduler of a Dask cluster, instead of this machine")
     add("--json", action="store_true", help="print one JSON object")
     parser.set_defaults(command=run)

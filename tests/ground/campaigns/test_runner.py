@@ -468,7 +468,7 @@ def test_a_case_that_kills_three_workers_ends_the_campaign_and_the_results_stay(
             raise SystemExit
         return double(case)
 
-    text = r"case case-1 terminated 3 worker processes, the last with status -9"
+    text = r"case case-1: 3 worker processes died, the last with status -9: check the memory"
     with pytest.raises(CampaignError, match=text):
         fly(toy(dies), 3, 1, tmp_path, workers=1)
     assert results_in(tmp_path) == [{"value": 1}]

@@ -199,7 +199,11 @@ def test_each_result_is_yielded_with_its_key_as_soon_as_it_is_known(
     [
         (CancelledError(), CampaignError, "the scheduler at tcp://here is lost"),
         (CommClosedError(), CampaignError, "the scheduler at tcp://here is lost"),
-        (KilledWorker(), CampaignError, "case b terminated every worker that ran it, such as tcp://worker-3"),
+        (
+            KilledWorker(),
+            CampaignError,
+            "case b: every worker that ran it died, such as tcp://worker-3: check its memory",
+        ),
         (None, CampaignError, "other packages were sent to the cluster at tcp://here: only one checkout"),
         (ValueError("wrong"), ValueError, "wrong"),
     ],

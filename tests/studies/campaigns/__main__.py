@@ -37,7 +37,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         help="only cases with TEXT in their key, such as 'coil-x: open'",
     )
     parser.add_argument("--out", type=Path, metavar="DIR", help="folder (default runs/campaigns/NAME)")
-    parser.add_argument("--workers", type=_positive, metavar="N", help="processes (default: the cores)")
+    parser.add_argument("--workers", type=_positive, metavar="N", help="processes (default: number of cores)")
     parser.add_argument(
         "--dask", metavar="ADDRESS", help="scheduler of a Dask cluster, instead of this machine"
     )

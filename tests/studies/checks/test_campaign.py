@@ -97,7 +97,7 @@ def test_the_case_of_a_dead_worker_is_run_again_and_one_that_ends_three_workers_
 ) -> None:
     assert fly(deaths(tmp_path / "once", 0, 1), 1, 1, tmp_path / "a", workers=1).facts["runs"] == 2
     assert (tmp_path / "once" / "1").read_text() == "xxx"
-    with pytest.raises(CampaignError, match="case 1 terminated 3 worker processes, the last with status -9"):
+    with pytest.raises(CampaignError, match="case 1: 3 worker processes died, the last with status -9"):
         fly(deaths(tmp_path / "always", 0, 2), 1, 1, tmp_path / "b", workers=1)
     assert not (tmp_path / "b" / "temporary").is_symlink()
 
