@@ -745,7 +745,7 @@ class CoilMonitor:
         """Consider the current monitor faulty, and divide its later readings by `gain` if it is known."""
         if gain is not None:
             self._gain *= gain
-            why = f"the monitor measures {self._gain:.2f} of the current of each coil"
+            why = f"the monitor measures {self._gain:.2f} times the current of each coil"
         if gain is not None and abs(self._gain - 1.0) <= self._bounds.gain:  # the fault has ended
             self._gain = 1.0
             self._witness.trust_monitor()

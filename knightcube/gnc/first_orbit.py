@@ -193,7 +193,9 @@ def first_orbit(seen: Bearings) -> FirstOrbit:
         )
     if not possible.any():
         near, far = 1e-3 * np.exp([low, high])
-        raise ArcError(f"every orbit at {near:.4g} to {far:.4g} km leaves the Earth or hits it")
+        raise ArcError(
+            f"every orbit at a distance of {near:.4g} to {far:.4g} km escapes the Earth or hits it"
+        )
     state = fit.states(unknowns[None])[0]
     jacobian = fit.state_jacobian(unknowns)
     spread = jacobian @ covariance @ jacobian.T

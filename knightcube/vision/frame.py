@@ -550,7 +550,9 @@ def raw_counts(image: Image) -> tuple[Image, float, float]:
         counts = image - zero if floating else image.astype(np.uint64) - np.uint64(zero % (1 << 64))
         return counts.astype(kind), 1.0, float(zero)
     if not math.isfinite(high - low):
-        raise ArgumentError("image", f"pixels from {low:g} to {high:g}: divide them by a large number")
+        raise ArgumentError(
+            "image", f"pixels from {low:g} to {high:g}: their range overflows; scale them down"
+        )
     unit = max(count_of_floats(image), (high - low) / _MOST_COUNTS)
     counts = np.rint((image.astype(np.float64) - low) / unit)
     return counts.astype(np.uint32), unit, float(low)

@@ -205,7 +205,10 @@ def _refuse_malformed(frames: Sequence[MatchedFrame]) -> None:
         n = len(frame.points)
         shapes = (frame.points.shape, frame.sigma.shape, frame.directions.shape)
         if shapes != ((n, 2), (n,), (n, 3)):
-            raise CalibrationError(f"frame {number}: shapes {shapes}; give (n, 2), (n,) and (n, 3)")
+            raise CalibrationError(
+                f"frame {number}: points, sigma and directions have shapes {shapes}: "
+                "give (n, 2), (n,) and (n, 3)"
+            )
         if not (np.all(np.isfinite(frame.points)) and np.all(np.isfinite(frame.directions))):
             raise CalibrationError(f"frame {number}: points and directions must be finite")
 

@@ -359,7 +359,7 @@ class EstimatedEnvironment:
         """Return why a fix is physically impossible, or an empty text if the fix is possible."""
         perigee, radius = fix.at(fix.julian_date).perigee_radius, float(np.linalg.norm(fix.position))
         if not (perigee >= LOWEST_ORBIT and radius >= LOWEST_ORBIT):
-            return f"radius {1e-3 * radius:.0f} km, perigee radius {1e-3 * perigee:.0f} km is not an orbit"
+            return f"not an orbit: radius {1e-3 * radius:.0f} km, perigee radius {1e-3 * perigee:.0f} km"
         early = 0.0 if self._elements is None else self._elements.epoch - fix.julian_date
         return f"the date is {early:.1f} days before the epoch of the elements" if early > EARLIEST else ""
 

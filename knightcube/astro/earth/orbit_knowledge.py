@@ -215,7 +215,7 @@ class TwoLineElements:
             raise OrbitError(
                 f"the elements of {begin:%Y-%m-%d} do not give the orbit on {end:%Y-%m-%d}: the standard "
                 f"deviation of the position exceeds {1e-3 * LARGEST_SIGMA:.0f} km "
-                f"at {abs(julian_date - self.epoch):.0f} days from the epoch: take elements of about this day"
+                f"at {abs(julian_date - self.epoch):.0f} days from the epoch: use elements near this date"
             )
         state = self.at(julian_date)
         if not LOWEST_RADIUS <= float(np.linalg.norm(state.position)) < math.inf:

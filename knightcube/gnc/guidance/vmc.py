@@ -523,9 +523,7 @@ def _check(
             raise PlanningError(f"{name} is {states[name]:.4f}: beyond the limit of {q2_limit}")
     for name in ("start_rate", "end_rate"):
         if abs(states[name]) > FASTEST:
-            raise PlanningError(
-                f"{name} is {states[name]:g} rad/s: beyond {FASTEST} rad/s nothing can be planned"
-            )
+            raise PlanningError(f"{name} is {states[name]:g} rad/s: it must lie within +-{FASTEST} rad/s")
     if not HORIZON_RANGE[0] <= horizon <= HORIZON_RANGE[1]:
         raise PlanningError(f"horizon is {horizon} s: it must be {HORIZON_RANGE[0]} to {HORIZON_RANGE[1]} s")
     if not 1.0 <= max_stretch <= 1e3:

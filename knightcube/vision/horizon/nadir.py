@@ -331,7 +331,7 @@ def nadir_of_uncertain_field(
     if weights[sound].sum() <= _MOST_REFUSED:
         if trials:
             return trials[int(np.argmax(np.where(sound, 0.0, weights)))].solution
-        reason = first.reason or "no limb is found with other fields of view within the uncertainty"
+        reason = first.reason or "no limb is found with any field of view within the uncertainty"
         status = HorizonStatus.REFUSED if first.nadir is not None else first.status
         return replace(first, status=status, reason=reason, nadir=None)
     nadirs = [trial.nadir for trial in trials]

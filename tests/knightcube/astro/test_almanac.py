@@ -227,7 +227,7 @@ def test_elements_are_accepted_until_their_standard_deviation_reaches_its_limit(
     assert 10 < days < 20
     times = [epoch + timedelta(days=sign * (days - 1)) for sign in (-1, 1)]
     assert propagate_elements((FIRST, SECOND), times)[0].shape == (2, 3)
-    with pytest.raises(OrbitError, match=f"{days} days from the epoch: take elements of about this day"):
+    with pytest.raises(OrbitError, match=f"{days} days from the epoch: use elements near this date"):
         propagate_elements((FIRST, SECOND), [epoch + timedelta(days=days)])
 
 

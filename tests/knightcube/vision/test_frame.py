@@ -84,7 +84,7 @@ def test_other_numbers_become_sixteenths_of_their_noise() -> None:
     assert gain_in_counts(2.0, 0.5) == 1.0
     assert gain_in_counts(1.0, 1e-5) == 1.0, "the pixel values are not counts"
     assert gain_in_counts(1e-4, 1.0) == 1e-4
-    with pytest.raises(ArgumentError, match="divide them"):
+    with pytest.raises(ArgumentError, match="scale them"):
         raw_counts(np.array([[-1.7e308, 1.7e308]]))
 
 

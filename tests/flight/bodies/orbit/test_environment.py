@@ -112,7 +112,7 @@ def test_a_fix_with_an_impossible_velocity_is_refused(elements: TwoLineElements,
     ):
         sound = reading(elements, 0)
         assert not known.fix(replace(sound, velocity=speed * sound.velocity))
-        assert "is not an orbit" in known.refusal
+        assert "not an orbit" in known.refusal
         assert any([known.fix(reading(elements, second * SECOND_NS)) for second in range(1, 4)])
 
 
