@@ -89,8 +89,8 @@ def plain(path: str) -> str:
     Raises UsageError for a relative path, and for a path that could change the meaning of the unit file.
     """
     if not _PLAIN.fullmatch(path):
-        form = "absolute, has no `..`, and consists of letters, digits and _ . / : + , @ = -"
-        raise UsageError(f"{path!r}: a path of a board is {form}")
+        form = "be absolute, without `..`, of letters, digits and _ . / : + , @ = -"
+        raise UsageError(f"{path!r}: a path on the board must {form}")
     return path
 
 

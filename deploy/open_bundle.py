@@ -254,7 +254,7 @@ def write_set(text: str, folder: Path) -> None:
         board_dropin.check_single(path)
         config = load(path)
         if config.link is None or config.commands.socket is None:
-            raise Refused("a configuration without `link` and `commands.socket` would end the contact")
+            raise Refused("without `link` and `commands.socket` in the configuration, contact would be lost")
         made = {
             "knightcube": board_dropin.dropin(config),
             "knightcube-safe": board_dropin.safe_dropin(config),

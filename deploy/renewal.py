@@ -514,7 +514,9 @@ class Renewal:
                 # install.sh keeps the release `current` as the fallback, so this must be a confirmed release.
                 self._board.point("current", trial.old)
         if ended:
-            self._report(ended[0], "failed", ended[1], "install.sh was run: its version stays")
+            self._report(
+                ended[0], "failed", ended[1], "install.sh was run: the version that it installed is kept"
+            )
             self._save()
 
     def _next_request(self) -> str:
@@ -663,7 +665,7 @@ class Renewal:
         if board.active(SAFE) or not (board.active(FLIGHT) and board.active(LINK)):
             raise Refused("flight or link is not running: confirm the trial when both run")
         if other := self._other_release(trial):
-            raise Refused(f"flight or link run release {other} instead")
+            raise Refused(f"flight or link runs release {other} instead")
         previous = trial.old if trial.what == "configuration" else state.previous
         self._store(trial=None, previous=previous, versions={**state.versions, kind: trial.version})
         text = f"{kind} {trial.version} is kept"
@@ -809,7 +811,7 @@ class Renewal:
         elif trial.down_s >= DOWN_S:
             self._begin_revert(f"flight or link did not run for {DOWN_S:.0f} s")
         elif other:
-            self._begin_revert(f"flight or link run release {other} instead")
+            self._begin_revert(f"flight or link runs release {other} instead")
         elif contact.get("fault") and contact["session"] != trial.session and not trial.despite_faults:
             self._begin_revert(f"the flight reported a fault: {contact['fault']}")
         elif trial.left_s <= 0.0:

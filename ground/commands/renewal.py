@@ -68,11 +68,11 @@ def configure(parser: argparse.ArgumentParser) -> None:
     signed.add_argument(
         "path", type=Path, metavar="FILE", help="the artefact to sign; for a release, its folder of sources"
     )
-    text = "version, above the last version (for a release by default 200 for 0.2.0, 10203 for 1.2.3)"
+    text = "version number, above the last (default for a release: 200 for 0.2.0, 10203 for 1.2.3)"
     signed.add_argument("--version", type=int, metavar="N", help=text)
     signed.add_argument("--back", action="store_true", help="permit a version that is not newer")
     signed.add_argument(
-        "--expires", metavar="DATE", help="end of the signature, such as 2030-01-01 (default none)"
+        "--expires", metavar="DATE", help="end of validity, such as 2030-01-01 (default none)"
     )
     signed.add_argument(
         "--least", type=int, default=1, metavar="N", help="lowest version of the new metadata (default 1)"
@@ -231,8 +231,8 @@ def sign(options: argparse.Namespace, data: bytes) -> Path:
     unnamed = bundle.with_name(f"{bundle.name}.part")
     packed = _bundle({**files, **new}, kind, data)
     if len(data) > _LARGEST or len(packed) > LARGEST_UP:
-        problem = f"at most {_LARGEST} bytes, {LARGEST_UP} in a bundle, are accepted on board: remove files"
-        raise UsageError(f"{kind}: has {len(data)} bytes, {len(packed)} in a bundle: {problem}")
+        limits = f"the board accepts {_LARGEST} bytes, {LARGEST_UP} in the bundle: remove files"
+        raise UsageError(f"{kind}: has {len(data)} bytes, {len(packed)} in the bundle; {limits}")
     replace_file(LinuxFiles(), unnamed, packed)
     for name, content in new.items():
         replace_file(LinuxFiles(), folder / "metadata" / name, content)

@@ -158,4 +158,4 @@ def test_no_path_of_a_configuration_adds_a_setting_to_a_unit(
     tree[section][key] = value
     changed.write_text(yaml.safe_dump(tree), encoding="utf-8")
     assert board_dropin.main([str(changed), str(tmp_path)]) == 2
-    assert "a path of a board is absolute, has no `..`, and consists of" in capsys.readouterr().err
+    assert "a path on the board must be absolute, without `..`, of letters" in capsys.readouterr().err

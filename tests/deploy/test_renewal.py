@@ -220,7 +220,7 @@ def test_a_fault_ends_the_trial_unless_it_was_permitted(board: RenewedBoard) -> 
         ("cut", "damaged"),
         ("foreign key", "UnsignedMetadataError"),
         ("invalid", "`coils.bus`"),
-        ("no link", "would end the contact"),
+        ("no link", "contact would be lost"),
         ("extends", "`extends` cannot be used on a board"),
     ],
 )
@@ -374,9 +374,9 @@ def test_a_trial_ends_if_flight_or_link_run_another_release(board: RenewedBoard,
     with running_the_old_release(board, unit):
         board.step()
     assert board.release() == "old"
-    assert board.reports(confirmed)[-1] == ("failed", f"flight or link run release {FIRST} instead")
+    assert board.reports(confirmed)[-1] == ("failed", f"flight or link runs release {FIRST} instead")
     result, text = board.reports(request)[-1]
-    assert (result, f"run release {FIRST} instead" in text) == ("failed", True), text
+    assert (result, f"runs release {FIRST} instead" in text) == ("failed", True), text
 
 
 def test_a_trial_begins_when_the_release_is_built_even_after_a_kill(board: RenewedBoard) -> None:
@@ -686,7 +686,10 @@ def test_an_accepted_configuration_is_not_replaced_at_the_end_of_a_trial(board: 
     board.run("--accepted", "configuration")
     board.step(4000.0)
     assert board.flown() == "second"
-    assert board.reports(request)[-1] == ("failed", "install.sh was run: its version stays")
+    assert board.reports(request)[-1] == (
+        "failed",
+        "install.sh was run: the version that it installed is kept",
+    )
     board.request("withdraw")
     board.step()
     assert board.flown() == before, "the configuration before the trial is kept for the ground"

@@ -93,7 +93,7 @@ def test_a_release_that_is_too_large_for_the_board_is_not_signed(
     source = _sources(tmp_path / "source", "1.2.3")
     monkeypatch.setattr(renewal, limit, 1000)
     done = command("renewal", "sign", signing, "release", source, "--out", tmp_path / "out")
-    assert (done.returncode, "are accepted on board: remove files" in done.stderr) == (2, True), done.stderr
+    assert (done.returncode, "in the bundle: remove files" in done.stderr) == (2, True), done.stderr
     monkeypatch.undo()
     assert list((tmp_path / "out").iterdir()) == []
     assert not (signing / "metadata/targets.json").exists(), "no version is used up"
