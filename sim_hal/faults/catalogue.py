@@ -634,7 +634,7 @@ def _frame_faults(device: str, *without: str, **parameters: Parameter) -> tuple[
         ("frozen", "the same frame repeatedly", _shown, {}),
         ("torn", "upper part of the previous frame, lower part of this one", _shown, {}),
         ("garbage", "random pixels", _shown, {}),
-        ("wrong", "rows in the opposite order", _shown, {}),
+        ("wrong", "rows in reverse order", _shown, {}),
         ("slow", "only every n-th trigger gives a frame", _thinned, {"n": _count(3.0, 2.0, 1000.0)}),
         ("delayed", "frames arrive later, s", _late, {"delay": _delay(3.0)}),
         ("intermittent", "off intermittently", intermittently(_shown), _turns(6.0)),
@@ -702,7 +702,7 @@ def _worker_faults(device: str) -> tuple[FaultKind, ...]:
 RAILS = ("battery-monitor", "bus-monitor")
 """Monitors of the power system, in the order of `EmulatedPower.rails`."""
 _EACH_BIT = "each bit flips with this probability"
-_EACH_FIELD = f", {FIELD_BITS} to each of its fields"
+_EACH_FIELD = f"; each of its fields has {FIELD_BITS} bits"
 _LOW_AT_TIMES = "the clock line is held low intermittently"
 _WRONG = {"angle": Parameter(0.2, -math.pi, math.pi, "rad"), "rate": Parameter(0.05, -10.0, 10.0, "rad/s")}
 _RATE = Parameter(230400.0, min(BAUD_RATES), max(BAUD_RATES), "baud", choices=BAUD_RATES)
@@ -782,7 +782,7 @@ _ALL = (
     _fault("strings: off", "no power: no converter acknowledges", _parts_off),
     _fault(
         "strings: dead",
-        "this string gives no current; 0: all strings",
+        "a string gives no current; 0 is all strings",
         _dead,
         {"string": _count(1.0, 0.0, 4.0)},
     ),
@@ -808,13 +808,13 @@ _ALL = (
     _fault("battery: cell-lost", "a cell gives no voltage", _held("cells_lost", lambda *_: 1, 0)),
     _fault(
         "battery: weak",
-        "the capacity is divided by factor, the resistance is multiplied",
+        "capacity divided by factor, resistance multiplied by it",
         _held("weakness", lambda _, given: given["factor"], 1.0),
         {"factor": Parameter(4.0, 1.0, 100.0)},
     ),
     _fault(
         "panels: lost",
-        "this panel gives no power; 0: all panels",
+        "a panel gives no power; 0 is all panels",
         _held("lost_panel", lambda _, given: round(given["panel"]), None),
         {"panel": _count(1.0, 0.0, 32.0)},
     ),

@@ -92,7 +92,7 @@ def _seconds(word: str, after: str, text: str) -> float:
     if value < 0.0:
         raise UsageError(f"fault {text!r}: {after} {word}: seconds cannot be below zero")
     if value > LONGEST:
-        raise UsageError(f"fault {text!r}: {after} {word}: seconds go up to {LONGEST:g}")
+        raise UsageError(f"fault {text!r}: {after} {word}: give at most {LONGEST:g} s")
     return value
 
 
@@ -125,7 +125,7 @@ def schedule(entries: Sequence[FaultEntry]) -> tuple[ScheduledFault, ...]:
         at = fault.at if entry.at is None else entry.at
         span = fault.span if entry.span is None else entry.span
         if max(at, span or 0.0) > LONGEST:
-            raise UsageError(f"{key}: seconds go up to {LONGEST:g}")
+            raise UsageError(f"{key}: give at most {LONGEST:g} s")
         read.append(replace(fault, at=at, span=span))
     return tuple(read)
 

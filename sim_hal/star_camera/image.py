@@ -536,7 +536,9 @@ class AttitudeHistory:
             raise OutOfRange(DEVICE, "norm of an attitude quaternion", worst, 1.0 - 1e-6, 1.0 + 1e-6, "")
         greatest = float(np.max(_turns(self.quaternions)))
         if greatest > GREATEST_TURN:
-            raise OutOfRange(DEVICE, "turn between two attitude samples", greatest, 0.0, GREATEST_TURN, "rad")
+            raise OutOfRange(
+                DEVICE, "rotation between two attitude samples", greatest, 0.0, GREATEST_TURN, "rad"
+            )
 
     @property
     def span(self) -> float:

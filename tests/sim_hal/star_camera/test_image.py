@@ -441,7 +441,7 @@ def test_impossible_stars_and_attitudes_are_refused() -> None:
     with pytest.raises(OutOfRange, match="norm of an attitude"):
         expected_electrons(SMALL, star, [3.0], times, 1.01 * attitudes)
     flipped = quaternion.multiply(quaternion.from_rotation_vector(np.array([3.0, 0.0, 0.0])), POINTING)
-    with pytest.raises(OutOfRange, match="turn between"):
+    with pytest.raises(OutOfRange, match="rotation between"):
         expected_electrons(SMALL, star, [3.0], times, np.stack([POINTING, flipped]))
 
 
