@@ -193,7 +193,7 @@ class OrbitPrediction:
             for edge in (self.begin, self.end):
                 self._elements.at(julian_date(edge))
         except OrbitError as error:
-            raise UsageError(f"the elements describe no orbit from {begin:%Y-%m-%d} on: {error}") from error
+            raise UsageError(f"no passes from {begin:%Y-%m-%d} on: {error}") from error
 
     @property
     def period_s(self) -> float:

@@ -57,10 +57,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "Make two-line elements for the section `elements` of a satellite's configuration: of an orbit that "
         "is given by its altitude, of the simulated orbit of a configuration, or by a fit to "
         "positions, or read them from a file of CelesTrak or Space-Track. "
-        "Prints the elements, the distances of the positions from them, and the standard deviation of the "
-        "error along the track that builds up in a day according to these distances. Positions far outside "
-        "are rejected. The elements of an orbit are fitted to one day of it with the oblateness J2, without "
-        "drag."
+        "Prints the elements, the distances of the positions from their orbit, and the standard deviation of "
+        "the along-track error that grows in a day, estimated from these distances. Outliers among the "
+        "positions are rejected. The elements of an orbit are fitted to one day of it with the oblateness "
+        "J2, without drag."
     )
     parser.epilog = (
         "examples:\n"

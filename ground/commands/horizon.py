@@ -56,7 +56,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.epilog = "example: knightcube horizon limb.png --fov 67 --altitude 515 --overlay limb_found.png"
     add_picture(parser)
     add_field(parser, required=True)
-    text = "standard deviation of --fov; pictures of other fields of view are tried too (default 0)"
+    text = "standard deviation of --fov; other fields of view within it are tried too (default 0)"
     parser.add_argument("--fov-error", type=positive, metavar="DEG", help=text)
     height = parser.add_mutually_exclusive_group()
     height.add_argument(

@@ -268,10 +268,10 @@ def _text(made: _Identified) -> str:
         lines.append(f"  {label:18s}{value:34s} {sources[name]}")
     if field is None:
         why = "the coils were never off long enough, or the field did not rotate with the body"
-        lines += ["", f"field:  not measured because {why}: as configured"]
+        lines += ["", f"field:  as configured; not measured because {why}"]
     else:
         measured = f"{1e4 * field.magnitude:.4f} gauss from the magnetometer"
-        measured += f" less its offset of {1e4 * field.offset:.4f} gauss" if field.offset else ""
+        measured += f" minus its offset of {1e4 * field.offset:.4f} gauss" if field.offset else ""
         lines += ["", f"field:  {measured}, with a scale error of {100.0 * MAGNETOMETER_ERROR:g} %"]
     verdict = "are white" if found.whiteness.passed else "are NOT white: the errors are increased accordingly"
     lines.append(

@@ -47,7 +47,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube mission-control` to the parser."""
     parser.description = (
         "Run the mission control system Yamcs for the satellite of a configuration. Yamcs gets the "
-        "satellite's telemetry, limits and commands from our tables, and reaches the satellite through a "
+        "satellite's telemetry, limits and commands from this software, and reaches the satellite through a "
         "gateway in this process, which holds the keys. Yamcs archives all packets, raises alarms at the "
         "limits, transfers files, executes command stacks and, with --station or --stations, shows the "
         "passes on its timeline. Needs Java 17 and the extra `interop`. Loopback only. Ctrl-C ends."

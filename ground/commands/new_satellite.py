@@ -280,7 +280,7 @@ def warnings_of(satellite: Satellite, values: Derived) -> list[str]:
         field = (
             f"at an inclination of {inclination:g} deg the magnetic field is nearly along the orbit normal"
         )
-        found.append(f"{field}, about which coils have little torque: simulate the pointing of a revolution")
+        found.append(f"{field}, so the coils have little torque about it: simulate pointing for a revolution")
     ratio = values.coil_torque / values.disturbance
     if ratio < _WEAK:
         torque = f"the coils' torque is {ratio:.2g} times the largest disturbance torque"

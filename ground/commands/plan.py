@@ -48,7 +48,7 @@ def configure(parser: argparse.ArgumentParser) -> None:
         "example: knightcube plan --from 0.4 --from-rate 0.015 --to -0.3 --picture path.png; in orbit: "
         "knightcube plan --orbit orbit --from nadir --to sun --at 2026-03-01T12:00:00 --within 600"
     )
-    text = "q2 at the start, or a target such as nadir with --orbit"
+    text = "q2 = sin(angle / 2) at the start, or a target such as nadir with --orbit"
     parser.add_argument("--from", dest="start", required=True, metavar="Q2", help=text)
     text = "q2 at the end, or a target such as sun with --orbit"
     parser.add_argument("--to", dest="end", required=True, metavar="Q2", help=text)
@@ -353,7 +353,7 @@ def _orbit_text(facts: dict[str, object]) -> str:
     if "elevation_deg" in facts:
         elevation = float(str(facts["elevation_deg"]))
         hidden = ": the Earth hides it" if elevation < 0.0 else ""
-        seen = f"target:        the satellite ends {elevation:.1f} deg above its horizon{hidden}\n"
+        seen = f"target:        elevation of the satellite {elevation:.1f} deg at the end{hidden}\n"
     kept = "".join(f"{name + ':':15}{value:.2f} deg outside its cone\n" for name, value in clear.items())
     return (
         f"status:        {facts['status']}\n"
@@ -363,7 +363,7 @@ def _orbit_text(facts: dict[str, object]) -> str:
         f"energy:        {facts['energy_J']:.5f} J, integral of R I^2\n"
         f"peak dipole:   {100.0 * float(str(facts['peak_of_limit'])):.1f} % of the limit\n"
         f"dipole limits: {largest} A m^2\n"
-        f"turn:          {facts['turn_deg']:.2f} deg, the {facts['way_round']} way, "
+        f"rotation:      {facts['turn_deg']:.2f} deg, the {facts['way_round']} way, "
         f"on a path of {facts['way_deg']:.1f} deg\n"
         f"peak rate:     {facts['peak_rate_deg_s']:.3f} deg/s\n"
         f"{kept}{seen}"

@@ -77,10 +77,10 @@ def configure(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--gain", type=positive, metavar="E", help="electrons per count (default 1)")
     parser.add_argument("--saturation", type=positive, metavar="COUNTS", help="counts of a saturated pixel")
     parser.add_argument("--psf", type=positive, metavar="PX", help="point spread, 1 sigma, px (default 1)")
-    text = "time between rows, 0 for a global shutter (default: unknown, about 0)"
+    text = "time between rows, 0 for a global shutter (default: unknown, near 0)"
     parser.add_argument("--line-time", type=finite, metavar="S", help=text)
     parser.add_argument("--prior", type=finite, nargs=3, metavar=("X", "Y", "Z"), help="rough rate, rad/s")
-    text = "estimator (default likelihood); the others are the corner detectors of the thesis"
+    text = "estimator (default likelihood); the others are the corner detectors of Sease (2013)"
     parser.add_argument("--method", choices=(LIKELIHOOD, *DETECTOR_NAMES), default=LIKELIHOOD, help=text)
     add_output(parser, run)
 

@@ -21,7 +21,7 @@ from knightcube.errors import UsageError
 def configure_report(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube report` to the parser."""
     parser.description = (
-        "Print the performance of a run and the limits of the thesis (Table 5.3), and draw its figures. The "
+        "Print the performance of a run and the limits of Sease (2013, Table 5.3), and draw its figures. The "
         "run is judged on the truth of the simulation if it has one, otherwise on the estimate. With a "
         "second run the two are compared: configuration, figures and events, with the differences; "
         "--figures draws both."

@@ -326,7 +326,7 @@ def configure_parameters(parser: argparse.ArgumentParser) -> None:
     )
     parser.epilog = "example: knightcube parameters --to runs/socket modes.tumble_rate=0.3"
     _add_way(parser, 4.0)
-    parser.add_argument("--load", type=Path, metavar="FILE", help="YAML file of --save with all parameters")
+    parser.add_argument("--load", type=Path, metavar="FILE", help="load all parameters from a file of --save")
     parser.add_argument("--save", type=Path, metavar="FILE", help="write the table in use to this file")
     parser.add_argument("changes", nargs="*", metavar="NAME=VALUE", help="such as modes.tumble_rate=0.3")
     parser.set_defaults(command=run_parameters)
@@ -339,7 +339,9 @@ def run_parameters(options: argparse.Namespace) -> int:
     changes = dict(map(_change, options.changes))
     before, _ = _ask(options, commands.DumpParameters())
     if before is None:
-        raise KnightCubeError("the flight sent no table of parameters: repeat it or use a longer --timeout")
+        raise KnightCubeError(
+            "the flight sent no table of parameters: repeat the command or use a longer --timeout"
+        )
     wanted = {**(file or before.values), **changes}
     if problem := commands.problem_of(wanted):
         raise UsageError(problem)
@@ -425,7 +427,7 @@ def _change(text: str) -> tuple[str, float]:
     """Return the name and the value of an argument NAME=VALUE. Raises UsageError."""
     key, _, value = text.partition("=")
     if key not in PARAMETER_KEYS:
-        raise UsageError(f"{key}: no such parameter; there are {', '.join(PARAMETER_KEYS)}")
+        raise UsageError(f"{key}: no such parameter; the parameters are {', '.join(PARAMETER_KEYS)}")
     try:
         return key, float(value)
     except ValueError as error:

@@ -56,10 +56,10 @@ IMAGE = "image"
 def configure(parser: argparse.ArgumentParser) -> None:
     """Add the arguments of `knightcube solve` to the parser."""
     parser.description = (
-        "Determine where a picture of the sky points: right ascension, declination and roll (the position "
-        "angle of up, from north through east), ICRS; which stars it shows; and, from star streaks, "
-        "how the camera turned. PNG, TIFF, JPEG, BMP, PGM or FITS. Without --fov or --camera all fields from "
-        f"{UNKNOWN_FOV_DEG[0]:g} to {UNKNOWN_FOV_DEG[1]:g} deg are searched."
+        "Determine where a picture of the sky points: right ascension, declination and roll (position angle "
+        "of its upward direction, from north through east), ICRS; which stars it shows; and, from star "
+        "streaks, how the camera rotated. PNG, TIFF, JPEG, BMP, PGM or FITS. Without --fov or --camera all "
+        f"fields from {UNKNOWN_FOV_DEG[0]:g} to {UNKNOWN_FOV_DEG[1]:g} deg are searched."
     )
     parser.epilog = "example: knightcube solve night.jpg --fov 11.4 --overlay solved.png"
     add_picture(parser)
@@ -237,7 +237,7 @@ def _text(solution: StarSolution, seconds: float, axis_sigma: float | None = Non
         f'field of view:    {solution.field_of_view_deg:.4f} deg across, {per_pixel:.2f}" per pixel',
         f"stars:            {len(stars)} of {len(frame.points)} {frame.kind.value} matched,"
         f" residual {rms:.2f} px rms per axis",
-        f"by chance:        10^{solution.log10_false_alarm:.0f}"
+        f"chance matches:   10^{solution.log10_false_alarm:.0f} expected"
         + (", by the light of faint stars" if frame.faint else ""),
     ]
     if axis_sigma:

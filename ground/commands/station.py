@@ -298,7 +298,7 @@ def configure_console(parser: argparse.ArgumentParser) -> None:
         "Show a flight in the browser: attitude in 3-D, plots with history, mode and health, events, the "
         "orbit on a map, and forms for commands. A flight in progress is shown live, from its log or over "
         "its link; a finished run is replayed on the same page. The page is served on loopback only, and "
-        "only to the browser that opens the printed address: its token is good for one browser. Needs the "
+        "only to the browser that opens the printed address: its token is valid for one browser. Needs the "
         "extra `ground`. Ctrl-C ends."
     )
     parser.epilog = (

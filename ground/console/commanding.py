@@ -117,7 +117,7 @@ class CommandForms:
     def _pack(self, name: str, given: Object) -> bytes:
         layouts = layouts_for(self.body, self._layouts)
         if name not in layouts:
-            raise UsageError(f"{name}: no such command; there are {', '.join(layouts)}")
+            raise UsageError(f"{name}: no such command; the commands are {', '.join(layouts)}")
         packet = layouts[name].packet
         unknown = sorted(set(given) - {field.name for field in packet.fields})
         if unknown:

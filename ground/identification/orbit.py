@@ -141,7 +141,7 @@ def learned_description(run: Run, config: OrbitConfig) -> LearnedDescription:
         if name != "camera" or config.camera is not None
     ]
     if not any(one.learned for one in found):
-        problem = "no uncertainty is below half of its configured value: fly longer"
+        problem = "every uncertainty is above half of its configured value: fly longer"
         raise InputError(str(run.folder), problem)
     time = float(last["time_ns"]) * 1e-9
     return LearnedDescription(config, time, {one.name: one for one in found}, learned_lens(run))
@@ -213,7 +213,10 @@ def _coils(found: LearnedDescription) -> list[str]:
     learned, coils = found.quantities["coils"], found.config.coils
     if not learned.learned:
         return []
-    lines = ["coils:", f"  windings:   # +- {learned.claim.max():.2g} relative to the inertia"]
+    lines = [
+        "coils:",
+        f"  windings:   # relative +- {learned.claim.max():.2g}, for the configured trace of the inertia",
+    ]
     dipoles = learned.value.reshape(3, 3) @ coils.map().dipoles
     for coil, channels, dipole in zip(coils.windings, coils.channels, dipoles.T, strict=True):
         strength = float(np.linalg.norm(dipole))

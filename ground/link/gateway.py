@@ -335,7 +335,7 @@ class Gateway:
             for packet in self._connections[line].stream.packets(data):
                 most = max(self._terminal.packet_bytes, LONGEST_IN_PORTIONS)
                 if len(packet) > most:
-                    raise StreamError(f"{len(packet)} bytes: the link carries {most}")
+                    raise StreamError(f"a packet has {len(packet)} bytes; the link carries {most}")
                 try:
                     counter = self._send(finished(packet, utc_ns()))
                 except KnightCubeError as error:

@@ -59,7 +59,9 @@ def make_keys(folder: Path) -> list[Path]:
     try:
         folder.mkdir(mode=0o700, parents=True)
     except FileExistsError as error:
-        raise UsageError(f"{folder} exists: keys are never overwritten, give another folder") from error
+        raise UsageError(
+            f"{folder}: exists already; keys are never overwritten: give another folder"
+        ) from error
     except OSError as error:
         raise UsageError(f"{folder}: cannot be made: {reason_of(error)}") from error
     ends = [folder / end for end in ("satellite", "ground")]

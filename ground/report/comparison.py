@@ -197,7 +197,7 @@ def _pointing(found: Object | None) -> Iterator[_Figure]:
         yield f"{name}: duration", (target["duration_s"], "s")
         yield f"{name}: axis error, rms", (_scaled(target["axis_rms_rad"], DEGREES), "deg")
         yield f"{name}: axis error, maximum", (_scaled(target["axis_worst_rad"], DEGREES), "deg")
-        yield f"{name}: error of all axes, rms", (_scaled(target["all_axes_rms_rad"], DEGREES), "deg")
+        yield f"{name}: error in all axes, rms", (_scaled(target["all_axes_rms_rad"], DEGREES), "deg")
         yield f"{name}: supply at the coils, average", (_scaled(target["supply_w"], 1e3), "mW")
         yield f"{name}: heat R I^2, average", (_scaled(target["heat_w"], 1e3), "mW")
 

@@ -423,7 +423,7 @@ def _health(health: Object | None) -> list[str]:
         return []
     good = ", ".join(f"{name} {number(share, 1, 1e2)} %" for name, share in health["streams_good"].items())
     lines = [
-        f"Health: streams good {good}",
+        f"Health: share of time with good readings: {good}",
         f"  conditions detected: {', '.join(health['facts']) or 'none'}; "
         f"watchdog fed {health['watchdog_fed']} times, wall clock set {health['clock_steps']} times",
     ]

@@ -236,7 +236,7 @@ def _parser(words: Sequence[str]) -> argparse.ArgumentParser:
 
 def _overview(available: Mapping[str, tuple[str, str, str]]) -> str:
     """Return the text above the options in `--help`: the commands by groups."""
-    lines = ["The on-board application of the KnightCube, and the tools of its ground."]
+    lines = ["On-board application of the KnightCube, and its ground tools."]
     for group, heading in GROUPS.items():
         lines += ["", f"{heading}:"]
         lines += [f"  {name:15} {purpose}" for name, (own, purpose, _) in available.items() if own == group]

@@ -444,7 +444,7 @@ def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Map
         return f"SPI {spi} must not change the key of the reserve SPI {change.spi}: send it under SPI 2"
     before = vault.read(change.spi)
     if before is not None and change.generation != before.generation + 1:
-        return f"the key of SPI {change.spi} is of generation {before.generation}"
+        return f"SPI {change.spi} has a key of generation {before.generation}: the new key must be the next"
     if vault.has_used(change.spi, change.key):  # recorded frames with this key would be accepted again
         return f"SPI {change.spi} {USED_KEY}: make a new key"
     if change.spi in COMMAND_SPIS:
@@ -456,7 +456,7 @@ def _change_key(change: NewKey, spi: int, vault: Vault, gate: Gate, sealers: Map
     return "" if done else "the key could not be stored"
 
 
-_CURE = "set a new key of SPI 1 by a command of SPI 2"
+_CURE = "set a new key for SPI 1 by a command under SPI 2"
 RESTORED = f"the keys were restored from a backup: {_CURE}"
 REBUILT = f"the folder of keys was lost: {_CURE}"
 TURN_NS = SECOND_NS // 50

@@ -219,7 +219,9 @@ def test_the_text_warns_of_coloured_innovations_and_of_a_field_that_was_not_meas
 def test_the_text_names_what_the_flight_reported_and_the_offset_of_the_magnetometer() -> None:
     lines = identify._text(made(offset=1e-5)).splitlines()
     assert lines[1] == "reported by the flight: imu-silent (2): no byte for 0.12 s"
-    assert lines[19].startswith("field:  0.4567 gauss from the magnetometer less its offset of 0.1000 gauss,")
+    assert lines[19].startswith(
+        "field:  0.4567 gauss from the magnetometer minus its offset of 0.1000 gauss,"
+    )
     assert identify._facts(made(offset=1e-5))["reported"] == ["imu-silent (2): no byte for 0.12 s"]
 
 

@@ -121,7 +121,10 @@ def test_a_table_with_an_infinite_number_is_refused(
 @pytest.mark.parametrize(
     ("word", "complaint"),
     [
-        ("modes.tumble_rat=1", "modes.tumble_rat: no such parameter; there are modes.arrived_angle,"),
+        (
+            "modes.tumble_rat=1",
+            "modes.tumble_rat: no such parameter; the parameters are modes.arrived_angle,",
+        ),
         ("modes.tumble_rate=fast", "give NAME=VALUE with a number"),
         ("modes.tumble_rate=99", "modes.tumble_rate = 99 must lie within 0.001 to 10 rad/s"),
         ("modes.tumble_rate=nan", "modes.tumble_rate = nan must lie within"),

@@ -118,7 +118,7 @@ def test_a_packet_for_a_longer_frame_closes_its_connection_alone(
     line = station.connect(station.line + unit)
     station.turn()
     assert closed(line)
-    assert "800 bytes: the link carries 700" in station.complaints[-1]
+    assert "800 bytes; the link carries 700" in station.complaints[-1]
     station.connect(station.line + ping)
     station.turn()
     assert station.satellite.up[-1][:2] == ping[:2]

@@ -349,7 +349,7 @@ def test_modes_health_and_events_are_listed() -> None:
     mode_text, health_text, event_text = blocks(modes=modes, health=health, events=events)[1:]
     assert mode_text.splitlines()[2].split() == ["hold", "1.500", "arrived", "-"]
     assert health_text.splitlines() == [
-        "Health: streams good imu 98.7 %",
+        "Health: share of time with good readings: imu 98.7 %",
         "  conditions detected: none; watchdog fed 5 times, wall clock set 1 times",
         "  maximum 0.26 of a core, 3 MiB, 45.7 deg C, memory slope 0.50 MiB/h, 7 MiB of disk free",
     ]

@@ -204,7 +204,7 @@ def test_a_lost_folder_of_keys_is_rebuilt_a_minute_after_it_was_found_missing(
     with ExitStack() as stack:
         _, names = link._open(place, inhibit, keys, judged, stack)
     assert names == "UDP 127.0.0.1:0"
-    cure = "the folder of keys was lost: set a new key of SPI 1 by a command of SPI 2"
+    cure = "the folder of keys was lost: set a new key for SPI 1 by a command under SPI 2"
     assert cure in capsys.readouterr().err
 
 
