@@ -10,11 +10,16 @@ from __future__ import annotations
 
 import heapq
 import itertools
+import sys
+import traceback
 from collections.abc import Callable, Sequence
 from typing import Protocol
 
+from flight.schema.document import MISTAKES
 from hal.buses.system import ContainedJob
+from hal.interfaces.errors import DeviceError
 from hal.interfaces.wires import Ticker
+from knightcube.errors import KnightCubeError, UsageError
 
 NEVER = 1 << 62
 """Time (ns) of an event that never occurs: 146 years, later than the end of any simulation."""
@@ -28,6 +33,39 @@ class EmulatedDevice(Protocol):
 
     def advance(self, now_ns: int) -> None:
         """Process all events of the device up to `now_ns` in order, each at its own time."""
+
+
+class EmulatorError(UsageError):
+    """Error raised if the code of an emulator or world of another package fails.
+
+    The message names the class, the file with the line, and the remedy. The error ends the simulation.
+    """
+
+
+_NOT_EMULATORS = {"flight", "hal", "knightcube", "numpy", "scipy", "sim_hal"} | sys.stdlib_module_names
+"""Packages whose classes are not emulators of another package."""
+
+
+def check_emulator(error: Exception) -> None:
+    """Raise EmulatorError if `error` was raised in a method of a class of another package.
+
+    Other errors, and errors that an emulator may raise (OSError for a chip that does not acknowledge, and
+    errors of devices and users), are not changed.
+    """
+    if isinstance(error, (OSError, DeviceError, KnightCubeError)):
+        return
+    frames = list(traceback.walk_tb(error.__traceback__))
+    for frame, _ in frames:
+        kind = type(frame.f_locals.get("self"))
+        package = kind.__module__.partition(".")[0]
+        if package in _NOT_EMULATORS:
+            continue
+        own = [one for one in frames if one[0].f_globals.get("__name__", "").partition(".")[0] == package]
+        last, line = (own or frames)[-1]
+        raise EmulatorError(
+            f"the emulator {kind.__module__}:{kind.__qualname__} failed: {last.f_code.co_filename}:{line}: "
+            f"{type(error).__name__}: {error}: correct this line"
+        ) from error
 
 
 class FaultTimeline:
@@ -63,24 +101,36 @@ class TimedSimulation:
 
     def next_event_ns(self) -> int:
         """Return the time of the earliest next event of all devices."""
-        return min([device.next_event_ns() for device in self._devices], default=NEVER)
+        try:
+            return min([device.next_event_ns() for device in self._devices], default=NEVER)
+        except MISTAKES as error:
+            check_emulator(error)
+            raise
 
     def run_events(self, event_ns: int) -> None:
         """Advance the world to `event_ns`, and run the devices whose events are due."""
-        self._advance_world(event_ns)
-        for device in self._devices:
-            if device.next_event_ns() <= event_ns:
-                device.advance(event_ns)
+        try:
+            self._advance_world(event_ns)
+            for device in self._devices:
+                if device.next_event_ns() <= event_ns:
+                    device.advance(event_ns)
+        except MISTAKES as error:
+            check_emulator(error)
+            raise
 
     def pass_to(self, time_ns: int) -> None:
         """Advance the world to `time_ns`, up to which no event is due."""
-        self._advance_world(time_ns)
+        try:
+            self._advance_world(time_ns)
+        except MISTAKES as error:
+            check_emulator(error)
+            raise
 
     def advance_to(self, time_ns: int) -> None:
         """Process all events up to `time_ns` in order."""
         while (event_ns := self.next_event_ns()) <= time_ns:
             self.run_events(event_ns)
-        self._advance_world(time_ns)
+        self.pass_to(time_ns)
 
 
 class TimedWorld(Protocol):
@@ -162,11 +212,19 @@ class SimTicker(ContainedJob):
     """A job that runs periodically in simulated time; the method `kick` runs it at once."""
 
     def __init__(self, clock: SimClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
-        super().__init__(name, job, clock.now_ns)
+        def run() -> None:
+            try:
+                job()
+            except EmulatorError as error:
+                self._mistake = error
+                raise
+
+        super().__init__(name, run, clock.now_ns)
         self.period_ns = period_ns
         self.due_ns = clock.now_ns() + period_ns
         self._clock = clock
         self._busy = False
+        self._mistake: EmulatorError | None = None
 
     def kick(self) -> None:
         """Run the job now, and restart the period of the job."""
@@ -174,7 +232,7 @@ class SimTicker(ContainedJob):
         self.run()
 
     def run(self) -> None:
-        """Run the job, unless it is already running."""
+        """Run the job, unless it is already running. Raises EmulatorError, which ends the simulation."""
         if self._busy:
             return
         self._busy = True
@@ -182,6 +240,8 @@ class SimTicker(ContainedJob):
             super().run()
         finally:
             self._busy = False
+        if self._mistake is not None:
+            raise self._mistake
 
     def stop(self) -> None:
         """Stop running the job."""

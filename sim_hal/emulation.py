@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Any
 
@@ -25,7 +25,7 @@ from flight.schema.devices import (
     axis_matrix,
     driver_of,
 )
-from flight.schema.document import ConfigError, call_named, imported
+from flight.schema.document import MISTAKES, ConfigError, call_named, imported
 from flight.schema.sections import Config
 from hal.buses.linux_wires import device_file
 from hal.drivers.coils import CoilSettings, wirings
@@ -34,6 +34,7 @@ from hal.interfaces.errors import NotResponding
 from hal.interfaces.wires import SerialPort, SpiDevice
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.quaternion import attitude_matrix
+from sim_hal.clock import check_emulator
 from sim_hal.emulators.coil_circuit import BridgeCircuit, CoilCircuit, CoilCondition, EmulatedIna219
 from sim_hal.emulators.i2c_bus import EmulatedI2cBus
 from sim_hal.emulators.pca9685 import EmulatedPca9685
@@ -103,7 +104,22 @@ class EmulatedWires:
         """Return an emulated device on an SPI bus. Raises NotResponding."""
         if device not in self.spi_devices:
             raise NotResponding(device, "no emulated device is connected to this SPI bus")
-        return self.spi_devices[device]
+        return _CheckedSpi(self.spi_devices[device])
+
+
+class _CheckedSpi:
+    """An emulated SPI device that reports mistakes in the code of another package (`check_emulator`)."""
+
+    def __init__(self, device: SpiDevice) -> None:
+        self._device = device
+
+    def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
+        """Send frames one after the other, and return the bytes received during each frame."""
+        try:
+            return self._device.transfer(frames)
+        except MISTAKES as error:
+            check_emulator(error)
+            raise
 
 
 def line_generator(seed: int, *line: int) -> np.random.Generator:

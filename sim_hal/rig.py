@@ -13,7 +13,7 @@ import select
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 from pathlib import Path
 from types import SimpleNamespace
@@ -480,7 +480,10 @@ class Served:
 
 @contextmanager
 def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
-    """Start a device server for a configuration, and end it afterwards. Raises NotResponding."""
+    """Start a device server for a configuration, and end it afterwards.
+
+    Raises NotResponding if the server does not start, or has ended before the flight.
+    """
     command = [sys.executable, "-m", "sim_hal", "serve", str(config_path), "--folder", str(folder)]
     process = subprocess.Popen(
         [*command, "--seed", str(seed), "--patience", str(PATIENCE_S)],
@@ -496,7 +499,17 @@ def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Serve
         if not line:
             raise NotResponding("emulated devices", f"the server did not start within {_START_S:g} s")
         with _connected(json.loads(line)) as served:
-            yield served
+            try:
+                yield served
+            except OSError:
+                with suppress(
+                    subprocess.TimeoutExpired
+                ):  # a server that is ending has closed its connections
+                    process.wait(timeout=5.0)
+                if process.returncode is None:
+                    raise
+        if process.poll() is not None:
+            raise NotResponding("emulated devices", "the server ended during the flight (see above)")
     finally:
         process.terminate()
         try:

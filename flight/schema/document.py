@@ -90,7 +90,7 @@ MODULES = "KNIGHTCUBE_MODULES"
 configuration may import, in addition to the known objects."""
 
 
-_MISTAKES = (
+MISTAKES = (
     AssertionError,
     ImportError,
     AttributeError,
@@ -121,7 +121,7 @@ def imported(key: str, named: str, known: Mapping[str, str], environment: Mappin
         raise ConfigError(key, f"is {named!r}, which is not permitted: add it as a line to {file} as root")
     try:
         return getattr(importlib.import_module(module), name)
-    except _MISTAKES as error:
+    except MISTAKES as error:
         if isinstance(error, OSError) and file is not None:
             raise
         problem = _import_problem(module, name, error, on_board=file is not None)
@@ -156,7 +156,7 @@ def call_named(
         return function(*arguments)
     except (KnightCubeError, DeviceError):
         raise
-    except _MISTAKES as error:
+    except MISTAKES as error:
         file = getattr(sys.modules.get(named.partition(":")[0]), "__file__", None)
         name = getattr(function, "__name__", type(function).__name__)
         problem = f"is {named!r}, whose function `{name}` failed: "

@@ -20,7 +20,9 @@ from dataclasses import dataclass
 from functools import reduce
 from typing import Protocol
 
+from flight.schema.document import MISTAKES
 from hal.buses.linux_wires import BLOCK_LIMIT, check_length
+from sim_hal.clock import check_emulator
 
 _TIMEOUT_NS = 20_000_000
 
@@ -176,8 +178,16 @@ class EmulatedI2cBus:
         """Send messages joined by repeated STARTs, and return the data of each read.
 
         At most one fault acts on a chip in a transaction. A bit flip changes the data that are read. If the
-        transaction only writes, a bit flip changes the data that are written after the register byte.
+        transaction only writes, a bit flip changes the data that are written after the register byte. Raises
+        EmulatorError if the code of a chip of another package fails.
         """
+        try:
+            return self._transferred(messages)
+        except MISTAKES as error:
+            check_emulator(error)
+            raise
+
+    def _transferred(self, messages: Sequence[Message]) -> list[bytes]:
         given: list[bytes] = []
         parts: list[I2cPart] = []
         fault: _Fault | None = None

@@ -179,6 +179,23 @@ def test_a_mistake_in_the_code_of_a_driver_is_named_with_its_line(
     )
 
 
+@pytest.mark.parametrize("clock", ["lock-step", "real time"])
+def test_a_mistake_in_the_code_of_an_emulator_ends_the_simulation_and_is_named_with_its_line(
+    folder: Path, capfd: pytest.CaptureFixture[str], clock: str
+) -> None:
+    """The mistake occurs in flight, when the driver reads a register. A traceback is not printed."""
+    text = (folder / "ina226.py").read_text(encoding="utf-8")
+    assert "volts / BUS_STEP_V)" in text
+    (folder / "ina226.py").write_text(text.replace("volts / BUS_STEP_V)", "volts / BUS)()"), encoding="utf-8")
+    words = ["run", "ina226.yaml", "--out", "run", *(["--realtime"] if clock == "real time" else [])]
+    assert main(words) == (1 if clock == "real time" else 2)
+    error = capfd.readouterr().err
+    named = r"the emulator ina226:EmulatedIna226 failed: .*ina226\.py:\d+: TypeError: .*: correct this line"
+    assert re.search(named, error), error
+    assert "Traceback" not in error
+    assert clock == "lock-step" or "knightcube: emulated devices: the server ended during the flight" in error
+
+
 def test_a_board_imports_the_driver_only_if_root_permits_it(
     folder: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import pytest
 
 from hal.buses.system import SystemClock
-from sim_hal.clock import SimClock
+from sim_hal.clock import NEVER, EmulatorError, SimClock, TimedSimulation
+from sim_hal.emulation import EmulatedWires
+from sim_hal.emulators.i2c_bus import EmulatedI2cBus, Registers
 
 MS = 1_000_000
 
@@ -77,6 +81,75 @@ def test_a_job_that_sleeps_lets_the_world_go_on_but_no_other_job() -> None:
     assert notes[:2] == [("beep", 10 * MS), ("beep", 20 * MS)]
     assert notes[2] == ("other", 22 * MS)
     assert clock.now_ns() == 22 * MS
+
+
+class Mistaken(Registers):
+    """An emulator of another package, whose methods raise the given errors."""
+
+    def __init__(self, advance: Exception | None = None, load: Exception | None = None) -> None:
+        super().__init__(0x40)
+        self._advance, self._load = advance, load
+
+    def next_event_ns(self) -> int:
+        return NEVER if self._advance is None else 10 * MS
+
+    def advance(self, now_ns: int) -> None:
+        assert self._advance is not None
+        raise self._advance
+
+    def store(self, register: int, value: int) -> None:
+        pass
+
+    def transfer(self, frames: Sequence[bytes]) -> list[bytes]:
+        return [bytes([self.load(0)]) for _ in frames]
+
+    def load(self, register: int) -> int:
+        if self._load is not None:
+            raise self._load
+        return 0
+
+
+NAMED = rf"the emulator {__name__}:Mistaken failed: .*test_clock.py:\d+: KeyError: 'x': correct this line"
+
+
+def test_a_mistake_in_a_timed_emulator_of_another_package_is_named() -> None:
+    clock = SimClock()
+    clock.attach(TimedSimulation(lambda _: None, [Mistaken(KeyError("x"))]))
+    with pytest.raises(EmulatorError, match=NAMED):
+        clock.sleep_until_ns(20 * MS)
+
+
+def test_a_mistake_in_a_chip_of_another_package_ends_the_job_that_reads_the_chip() -> None:
+    clock, bus = SimClock(), EmulatedI2cBus([Mistaken(load=KeyError("x"))])
+
+    def read() -> None:
+        bus.read_byte_data(0x40, 1)
+
+    clock.ticker("driver", 10 * MS, read)
+    with pytest.raises(EmulatorError, match=NAMED):
+        clock.sleep_until_ns(20 * MS)
+
+
+def test_a_mistake_in_an_spi_device_of_another_package_is_named() -> None:
+    wires = EmulatedWires(lambda: 0, 1, 1)
+    wires.spi_devices |= {"good": Mistaken(), "bad": Mistaken(load=KeyError("x"))}
+    assert wires.spi("good", 1_000_000, 3).transfer([b"a"]) == [b"\0"]
+    with pytest.raises(EmulatorError, match=NAMED):
+        wires.spi("bad", 1_000_000, 3).transfer([b"a"])
+
+
+def test_errors_that_a_chip_may_raise_and_errors_of_built_in_code_are_not_renamed() -> None:
+    bus = EmulatedI2cBus([Mistaken(load=OSError(121, "no acknowledge"))])
+    with pytest.raises(OSError, match="no acknowledge"):
+        bus.read_byte_data(0x40, 1)
+    clock = SimClock()
+
+    def job() -> None:
+        raise KeyError("x")
+
+    ticker = clock.ticker("job", MS, job)
+    clock.sleep_until_ns(8 * MS)
+    assert ticker.error == "KeyError: 'x'"
 
 
 def test_utc_is_the_label_of_the_start_plus_the_time_since() -> None:
