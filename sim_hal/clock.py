@@ -212,6 +212,8 @@ class SimTicker(ContainedJob):
     """A job that runs periodically in simulated time; the method `kick` runs it at once."""
 
     def __init__(self, clock: SimClock, name: str, period_ns: int, job: Callable[[], None]) -> None:
+        self._mistake: EmulatorError | None = None
+
         def run() -> None:
             try:
                 job()
@@ -224,7 +226,6 @@ class SimTicker(ContainedJob):
         self.due_ns = clock.now_ns() + period_ns
         self._clock = clock
         self._busy = False
-        self._mistake: EmulatorError | None = None
 
     def kick(self) -> None:
         """Run the job now, and restart the period of the job."""
