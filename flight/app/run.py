@@ -22,7 +22,8 @@ class RunRequest:
     The folder `archive` contains the runs of a flight computer; if it is given, its next run folder is used
     instead of `out`. If `accepted` is true and the file `config_path` is damaged, the last flown
     configuration is used instead. The simulated `faults` are injected in addition to the configured faults
-    (`sim_hal.faults.schedule`).
+    (`sim_hal.faults.schedule`). A `trial` of a simulated configuration uses no command socket and no stored
+    state, so that it does not affect another flight of the same configuration.
     """
 
     config_path: Path
@@ -34,6 +35,7 @@ class RunRequest:
     archive: Path | None = None
     faults: tuple[str, ...] = ()
     accepted: bool = False
+    trial: bool = False
 
 
 @dataclass(frozen=True, slots=True)

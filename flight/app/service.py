@@ -52,6 +52,7 @@ from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any, TypeVar
 
+import msgspec
 import numpy as np
 
 from flight.app.devices import corrupted_text
@@ -707,4 +708,8 @@ def requested_config(request: RunRequest, text: str | None = None) -> tuple[str,
         if not (np.isfinite(request.duration) and request.duration > 0.0):
             raise UsageError(f"--duration {request.duration}: must be a positive number of seconds")
         config = config.shortened(request.duration)
+    if request.trial:
+        commands = msgspec.structs.replace(config.commands, socket=None, udp=None)
+        state = msgspec.structs.replace(config.state, folder=None)
+        config = msgspec.structs.replace(config, commands=commands, state=state)
     return text, config

@@ -237,7 +237,8 @@ def fly_case(case: Case) -> Result:
     with tempfile.TemporaryDirectory(prefix="knightcube-") as place:
         config = Path(place) / f"{case.key}.yaml"
         config.write_text(given["config"], encoding="utf-8")
-        request = RunRequest(config, Path(place) / "run", duration=given["duration"], seed=given["seed"])
+        run, duration, seed = Path(place) / "run", given["duration"], given["seed"]
+        request = RunRequest(config, run, duration=duration, seed=seed, trial=True)
         try:
             flown = fly(request)
             report = summarise(read_run(request.out))

@@ -440,7 +440,7 @@ def _fly(verdict: CheckResult) -> None:
 
     duration, begun = min(FLOWN_S, verdict.config.duration), time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="knightcube-check-") as folder:
-        verdict.result = fly(RunRequest(verdict.path, Path(folder) / "run", duration=duration))
+        verdict.result = fly(RunRequest(verdict.path, Path(folder) / "run", duration=duration, trial=True))
     verdict.elapsed = time.perf_counter() - begun
     verdict.problems += flight_problems(verdict.result)
 

@@ -7,6 +7,7 @@ import math
 import shlex
 import subprocess
 import sys
+from contextlib import closing
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -16,6 +17,7 @@ import pytest
 import yaml
 
 from flight.app.cli import main, to_json
+from flight.link.commands import open_unix
 from ground.campaigns import varied
 from ground.campaigns.runner import Case, Result, fly
 from ground.campaigns.varied import (
@@ -233,6 +235,16 @@ def test_an_interrupted_flight_has_no_result() -> None:
         check=False,
     )
     assert done.stdout == "interrupted\n", done.stderr
+
+
+def test_a_campaign_flies_while_another_flight_uses_the_command_socket(tmp_path: Path) -> None:
+    path = tmp_path / "commands"
+    text = f"extends: {SIMULATION}\nname: mine\nduration: 0.5\nsteps: [{{at: 0.0, q2: 0.0}}]\ncamera: none\n"
+    (tmp_path / "mine.yaml").write_text(f"{text}commands: {{socket: {path}}}\n", encoding="utf-8")
+    campaign = varied_campaign(tmp_path / "mine.yaml", [variation_of("plant.inertia=1%")], None)
+    (case,) = campaign.cases(1, 1)
+    with closing(open_unix(path)):
+        assert fly_case(case)["error"] == ""
 
 
 def result(number: int, worst: float | None, error: str = "") -> Result:

@@ -8,7 +8,7 @@ import subprocess
 import sys
 import time
 from collections.abc import Iterator
-from contextlib import ExitStack
+from contextlib import ExitStack, closing
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -21,6 +21,7 @@ from flight.app import devices
 from flight.app.cli import run as checking
 from flight.app.cli.run import flight_problems
 from flight.app.run import RunResult
+from flight.link.commands import open_unix
 from flight.loop.flight_loop import FlightEnding
 from flight.schema import reader
 from flight.schema.devices import Sensor, SensorsSection, V4l2Device, WideCamera
@@ -51,6 +52,25 @@ def test_a_sound_simulation_flies_ten_seconds_and_is_ready(tmp_path: Path) -> No
     assert facts["drivers"] == drivers, "the devices are simulated, but their drivers are those of a board"
     assert facts["flight"]["mission_time_s"] == pytest.approx(10.0, abs=0.1)
     assert not Path(facts["flight"]["folder"]).exists(), "nothing is left behind"
+
+
+def test_a_simulation_is_checked_while_another_flight_uses_its_socket_and_its_state(tmp_path: Path) -> None:
+    """A check that used the state would count a boot, and a check that used the socket would be refused."""
+    path, state = tmp_path / "commands", tmp_path / "state"
+    state.mkdir()
+    steps = [{"at": 0.0, "q2": 0.0}]
+    mine = write(
+        tmp_path, DEMO, camera="none", steps=steps, duration=0.5,
+        commands={"socket": str(path), "udp": "127.0.0.1:0"}, state={"folder": str(state)},
+    )  # fmt: skip
+    flown = command("run", mine, "--out", tmp_path / "run")
+    assert flown.returncode == 0, flown.stderr
+    kept = {file.name: file.read_bytes() for file in state.iterdir()}
+    assert kept, "a flight stores its state"
+    with closing(open_unix(path)):
+        done = command("check", mine)
+    assert (done.returncode, done.stderr) == (0, "")
+    assert {file.name: file.read_bytes() for file in state.iterdir()} == kept
 
 
 def test_a_configuration_that_extends_another_is_checked_and_written_as_one_file(tmp_path: Path) -> None:
