@@ -61,7 +61,7 @@ while [ $# -gt 0 ]; do
     case $1 in
         --config | --wheels | --venv | --python)
             case ${2:-} in
-                '' | -*) fail "$1 wants a value, see --help" ;;
+                '' | -*) fail "$1 needs a value, see --help" ;;
             esac
             case $1 in
                 --config) config=$2 ;;
@@ -108,31 +108,31 @@ sum_of() { sha256sum <"$1" | sed 's/-$/flight.yaml/'; }
 # Reject wrong options before the first step.
 check_inputs() {
     [ "$action" != uninstall ] || return 0
-    [ -z "$purge" ] || fail "--purge goes with --uninstall"
-    [ "$action" = install ] || [ -z "$config$wheels$venv" ] || fail "--$action goes alone, see --help"
+    [ -z "$purge" ] || fail "--purge needs --uninstall"
+    [ "$action" = install ] || [ -z "$config$wheels$venv" ] || fail "--$action: omit --config, --wheels and --venv"
     if [ "$action" = rollback ]; then
         [ -e "$prefix/previous" ] || fail "--rollback: there is no previous release"
         return
     fi
-    [ -z "$wheels" ] || [ -z "$venv" ] || fail "--wheels and --venv: one of them, see --help"
+    [ -z "$wheels" ] || [ -z "$venv" ] || fail "--wheels and --venv: give one of them"
     [ -z "$wheels" ] || [ -d "$wheels" ] || fail "--wheels $wheels: no such folder"
     [ -z "$venv" ] || [ -x "$venv/bin/python" ] ||
         fail "--venv $venv: no virtual environment, bin/python is missing"
     if [ "$action" = accept ]; then
         [ -e "$settings/flight.yaml" ] || fail "--accept: there is no $settings/flight.yaml"
-        [ -x "$prefix/current/venv/bin/python" ] || fail "--accept: nothing is installed"
+        [ -x "$prefix/current/venv/bin/python" ] || fail "--accept: no release is installed: run install.sh first"
         return
     fi
     [ -n "$venv" ] || "$python" -c 'import sys; sys.exit(sys.version_info < (3, 11))' ||
-        fail "--python $python: Python 3.11 or newer is wanted"
+        fail "--python $python: Python 3.11 or newer is needed"
     flown=${config:-$source/config/board_testbed.yaml}
     { [ -f "$flown" ] && [ -r "$flown" ]; } || fail "--config $flown: cannot be read"
     [ -e "$settings/flight.yaml" ] || return 0
     [ -z "$config" ] || cmp -s "$config" "$settings/flight.yaml" ||
-        fail "--config $config: another one is flown; put yours there first: rm $settings/flight.yaml"
+        fail "--config $config: another configuration is installed: remove it first: rm $settings/flight.yaml"
     flown=$settings/flight.yaml
     [ ! -e "$flown.sha256" ] || [ "$(sum_of "$flown")" = "$(cat "$flown.sha256")" ] ||
-        fail "$flown is not what was accepted: was it edited? Then: install.sh --accept"
+        fail "$flown is not the accepted configuration: if you edited it, run install.sh --accept"
 }
 
 # Return whether systemd runs. In an image, neither systemd nor udev runs, so they are not reloaded.
@@ -152,7 +152,7 @@ reload() {
 
 make_user() {
     if [ -n "$root" ]; then
-        echo "install: make a system user $user in the image, in the groups dialout, i2c and video," \
+        echo "install: create a system user $user in the image, in the groups dialout, i2c and video," \
             "and for a link a system user $user-link of the group $user" >&2
         return
     fi
@@ -262,7 +262,7 @@ remove_link() {
 install_rules() {
     if [ -e "$rules" ] && [ -e "$shipped" ] && ! cmp -s "$rules" "$shipped"; then
         cmp -s "$deploy/99-knightcube.rules" "$shipped" ||
-            echo "install: $rules was edited and is kept; compare $deploy/99-knightcube.rules" >&2
+            echo "install: $rules was edited and is kept; compare it with $deploy/99-knightcube.rules" >&2
     else
         place 644 "$deploy/99-knightcube.rules" "$rules"
     fi
@@ -310,7 +310,7 @@ install_all() {
     install_modules
     reload
     command -v i2cset >/dev/null 2>&1 ||
-        echo "install: i2cset is missing (package i2c-tools): the coils are then zeroed by Python alone" >&2
+        echo "install: i2cset is missing (package i2c-tools): without it, only Python sets the coils to zero" >&2
     say_next installed
 }
 

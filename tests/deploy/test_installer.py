@@ -146,7 +146,7 @@ def test_only_the_option_accept_accepts_a_changed_configuration(image: Image, tm
     image.config.write_text(corrupted(TESTBED.read_text(encoding="utf-8"), 1, 7), encoding="utf-8")
     status, output = image.install()
     assert status == 2
-    assert "is not what was accepted: was it edited? Then: install.sh --accept" in output
+    assert "is not the accepted configuration: if you edited it, run install.sh --accept" in output
     shutil.copy(changed_testbed(tmp_path, coils_bus="/dev/knightcube-i2c"), image.config)
     status, output = image.call("--accept")
     assert (status, output.startswith("accepted")) == (0, True), output
@@ -167,7 +167,7 @@ def test_an_invalid_configuration_is_not_accepted(image: Image) -> None:
 def test_a_configuration_other_than_the_installed_one_is_refused(image: Image) -> None:
     status, output = image.install("--config", str(CONFIG))
     assert status == 2
-    assert f"another one is flown; put yours there first: rm {image.config}" in output
+    assert f"another configuration is installed: remove it first: rm {image.config}" in output
     assert image.config.read_bytes() == TESTBED.read_bytes()
 
 
@@ -279,15 +279,15 @@ def test_board_and_demonstration_have_the_versions_that_the_tests_have() -> None
     ("words", "output"),
     [
         (["--frobnicate"], "unknown option"),
-        (["--config"], "wants a value"),
-        (["--config", "--wheels"], "--config wants a value"),
+        (["--config"], "needs a value"),
+        (["--config", "--wheels"], "--config needs a value"),
         (["--dry-run", "--config", "/no"], "--config /no: cannot be read"),
         (["--dry-run", "--wheels", "/no"], "--wheels /no: no such folder"),
         (["--dry-run", "--venv", "/no"], "--venv /no: no virtual environment"),
         (["--dry-run", "--venv", "/no", "--wheels", "/tmp"], "one of them"),
-        (["--dry-run", "--python", "/no"], "--python /no: Python 3.11 or newer is wanted"),
-        (["--dry-run", "--purge"], "--purge goes with --uninstall"),
-        (["--dry-run", "--accept", "--config", str(TESTBED)], "--accept goes alone"),
+        (["--dry-run", "--python", "/no"], "--python /no: Python 3.11 or newer is needed"),
+        (["--dry-run", "--purge"], "--purge needs --uninstall"),
+        (["--dry-run", "--accept", "--config", str(TESTBED)], "--accept: omit --config, --wheels and --venv"),
         (["--dry-run", "--accept"], "there is no"),
         (["--dry-run", "--rollback"], "there is no previous release"),
     ],
