@@ -39,7 +39,7 @@ def main() -> None:
             time.sleep(0.01)
         answer = exchange(str(socket), CommandPacker().pack(Note("lamp on"), utc_ns=1), timeout=10.0)
         (row,) = decode(answer)[COMMAND.name]
-        print("answer:", "obeyed" if row["obeyed"] else "refused", "-", to_text(row["text"]))
+        print("answer:", "executed" if row["obeyed"] else "refused", "-", to_text(row["text"]))
         flight.wait()
         events = read_run(folder / "run")["event"]
         for event in events[events["name"] == b"commanded"]:

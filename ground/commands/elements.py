@@ -116,7 +116,7 @@ def run(options: argparse.Namespace) -> int:
     if options.altitude is None:
         given = [name for name in _ORBIT if getattr(options, name) is not None]
         if given:
-            raise UsageError(f"--{given[0].replace('_', '-')}: goes with --altitude")
+            raise UsageError(f"--{given[0].replace('_', '-')}: only with --altitude")
     if options.read is not None:
         newest = read_file(options.read, options.satellite)
         read = {"elements": list(newest.lines), "name": newest.name, "number": newest.number}
@@ -124,7 +124,7 @@ def run(options: argparse.Namespace) -> int:
         print_result(options, read, head + "".join(f"  - '{line}'\n" for line in newest.lines))
         return 0
     if options.satellite is not None:
-        raise UsageError("--satellite: goes with --read")
+        raise UsageError("--satellite: only with --read")
     velocities = None
     if options.fixes is not None:
         fixes = read_fixes(options.fixes)

@@ -213,7 +213,7 @@ def run_command(options: argparse.Namespace) -> int:
         raise KnightCubeError(f"{options.to}: its answer of {len(raw)} bytes is invalid") from error
     done, text = bool(row["obeyed"]), text_of(row["text"])
     facts = {"obeyed": done, "mode": mode.label, "text": text, "count": int(row["count"])}
-    print_result(options, facts, f"{'obeyed' if done else 'refused'}: {text}; mode {mode.label}\n")
+    print_result(options, facts, f"{'executed' if done else 'refused'}: {text}; mode {mode.label}\n")
     return 0 if done else 1
 
 

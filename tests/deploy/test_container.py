@@ -67,7 +67,7 @@ def test_the_renewal_runs_in_its_sandbox_and_has_systemd_restart_the_flight(
 
 
 def test_a_command_over_its_socket_is_answered(observations: dict[str, Any]) -> None:
-    assert observations["commanded"].startswith("obeyed: "), observations["commanded"]
+    assert observations["commanded"].startswith("executed: "), observations["commanded"]
 
 
 def test_the_service_waits_while_its_configuration_has_a_flipped_bit(observations: dict[str, Any]) -> None:

@@ -129,7 +129,7 @@ def test_an_extension_without_its_change_names_the_change(name: str) -> None:
 @pytest.mark.slow
 def test_a_new_command_is_obeyed_and_logged(tmp_path: Path) -> None:
     printed = run([str(EXAMPLES / "command.py")], patched("command", tmp_path / "tree")).stdout.splitlines()
-    assert printed[0] == "answer: obeyed - note lamp on"
+    assert printed[0] == "answer: executed - note lamp on"
     assert printed[1].endswith("commanded socket: note lamp on")
 
 

@@ -172,7 +172,7 @@ export class Commander {
       if (this.dialog.returnValue !== "send") return;
       say(place, "sent ...");
       const answer = await ask("/api/command", body);
-      say(place, answer.error ?? `${answer.obeyed ? "obeyed" : "refused"}: ${answer.text}`, answer.obeyed ? "answer" : "error");
+      say(place, answer.error ?? `${answer.obeyed ? "executed" : "refused"}: ${answer.text}`, answer.obeyed ? "answer" : "error");
     };
   }
 

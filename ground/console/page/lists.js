@@ -171,7 +171,7 @@ export class History extends Rows {
     if (again) this.clear();
     this.omit((omitted.command ?? 0) + (omitted.verification ?? 0));
     for (const command of listed.command ?? []) {
-      this.add(row([seconds(command), command.source, command.obeyed ? "obeyed" : "refused", command.text], command.obeyed ? "" : "warn", command));
+      this.add(row([seconds(command), command.source, command.obeyed ? "executed" : "refused", command.text], command.obeyed ? "" : "warn", command));
     }
     for (const step of listed.verification ?? []) {
       const name = label(step.stage, this.stage);

@@ -89,12 +89,12 @@ export class Health {
     }
     if (health) {
       const field = this.fields.get("health.facts");
-      add("monitors find", bitsOf(health.facts, field).length ? text(health.facts, field) : "nothing wrong", beyond(health.facts, field) || "good");
+      add("conditions", bitsOf(health.facts, field).length ? text(health.facts, field) : "none", beyond(health.facts, field) || "good");
       const wrong = this.judged.filter(([key, each]) => key !== "health.facts" && !this.streams.some(([other]) => other === key) && beyond(value(key), each));
       const poor = worst(wrong.map(([key, each]) => beyond(value(key), each)));
       add("beyond limits", wrong.map(([key, each]) => `${key} ${Array.isArray(value(key)) ? text(value(key), each) : label(value(key), each)}`).join(", ") || "nothing", poor || "good");
       add("coils in use", text(health.coils_in_use, this.fields.get("health.coils_in_use")), "", this.fields.get("health.coils_in_use"));
-      add("slots lost", String(health.slips), health.slips > 0 ? "warn" : "good", this.fields.get("health.slips"));
+      add("slots skipped", String(health.slips), health.slips > 0 ? "warn" : "good", this.fields.get("health.slips"));
     }
     if (heat !== null) add("coil heat (R I²)", `${(1e3 * heat).toFixed(1)} mW`, "", HEAT);
     if (supply) {

@@ -84,7 +84,7 @@ def test_the_command_line_sends_what_was_typed_and_prints_the_answer(
     channel.close()
     assert status == 0
     assert taken == [command]
-    assert capsys.readouterr().out == "obeyed: as commanded; mode hold\n"
+    assert capsys.readouterr().out == "executed: as commanded; mode hold\n"
 
 
 def test_over_udp_a_refusal_is_exit_status_1_and_one_json_object(capsys: pytest.CaptureFixture[str]) -> None:

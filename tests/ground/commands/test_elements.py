@@ -130,10 +130,10 @@ def test_elements_are_fitted_to_the_fixes_in_a_flight_log(tmp_path: Path) -> Non
         ),
         ((*ORBIT[:5], "noon"), "--epoch: 'noon': give a time such as"),
         (("--config", "step_demo"), "this needs the configuration of a satellite in orbit"),
-        (("--config", "orbit", "--anomaly", "3"), "--anomaly: goes with --altitude"),
+        (("--config", "orbit", "--anomaly", "3"), "--anomaly: only with --altitude"),
         (("--fixes", "absent.csv"), "absent.csv: cannot be read"),
         (("--read", "absent.json"), "absent.json: cannot be read"),
-        (("--config", "orbit_3u", "--satellite", "5"), "--satellite: goes with --read"),
+        (("--config", "orbit_3u", "--satellite", "5"), "--satellite: only with --read"),
     ],
 )
 def test_wrong_use_is_reported_in_one_line(words: tuple[str, ...], complaint: str) -> None:

@@ -100,7 +100,7 @@ def flight(monkeypatch: pytest.MonkeyPatch) -> Flight:
 
 @pytest.mark.parametrize(
     ("obeyed", "status", "line"),
-    [(True, 0, "obeyed: done; mode hold\n"), (False, 1, "refused: done; mode hold\n")],
+    [(True, 0, "executed: done; mode hold\n"), (False, 1, "refused: done; mode hold\n")],
 )
 def test_a_command_is_sent_and_its_answer_printed(
     flight: Flight, obeyed: bool, status: int, line: str

@@ -218,8 +218,8 @@ def test_the_page_shows_the_end_of_a_log_a_past_instant_and_the_state_of_the_tel
     found = FACTS_BIT["hot"] | FACTS_BIT["too-hot"]
     with (folder / "flight-0001.ccsds").open("ab") as file:
         file.write(Packer().pack(HEALTH, round(6.4e9), {**plain_contents(HEALTH), "facts": found}))
-    page.wait("document.getElementById('health').textContent.includes('monitors findhot, too-hot')")
-    assert page.page.locator(".card:has-text('monitors find') b").get_attribute("class") == "bad"
+    page.wait("document.getElementById('health').textContent.includes('conditionshot, too-hot')")
+    assert page.page.locator(".card:has-text('conditions') b").get_attribute("class") == "bad"
     stopped = {"code": 1, "severity": 0, "suppressed": 0, "name": events.STOPPED.name, "text": "<b>done</b>"}
     with (folder / "flight-0001.ccsds").open("ab") as file:
         file.write(Packer().pack(EVENT, round(6.5e9), stopped))
@@ -277,7 +277,7 @@ def test_the_form_offers_the_commands_of_a_satellite_and_refuses_wrong_values_be
         satellite.fill_one(f"quaternion {axis}", "0.4")
     satellite.wait("document.getElementById('answer').textContent.includes('length 0.8')")
     assert satellite.command("point", goal="ground", latitude="90", longitude="13.4", roll="") == (
-        "obeyed: as commanded"
+        "executed: as commanded"
     )
 
 

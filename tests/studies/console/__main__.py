@@ -85,7 +85,7 @@ def missed(figures: Figures, by_link: bool) -> list[str]:
     wrong = [name for name, bound in ASKED.items() if not getattr(figures, name) <= bound]
     wrong += [name for name in ("complaints", "strangers", "filed") if getattr(figures, name)]
     wrong += [] if figures.replay_equal or by_link else ["replay_equal"]
-    return wrong + ([] if figures.commanded.startswith("obeyed") else ["commanded"])
+    return wrong + ([] if figures.commanded.startswith("executed") else ["commanded"])
 
 
 def measure(config: Path, seconds: float, pictures: Path | None, by_link: bool = False) -> Figures:
