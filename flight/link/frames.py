@@ -253,7 +253,7 @@ def open_telemetry(frame: bytes, spacecraft: int) -> tuple[bytes, bytes, int]:
         raise FrameError("its length is wrong")
     (first,) = struct.unpack_from(">H", frame)
     if first >> 4 != spacecraft:
-        raise FrameError("it is another spacecraft's")
+        raise FrameError("it is for another spacecraft")
     return frame[: TELEMETRY_HEADER.size], frame[TELEMETRY_HEADER.size : -CRC_BYTES], first >> 1 & 7
 
 

@@ -285,7 +285,7 @@ def failing(tickers: Sequence[Ticker], now_ns: int) -> list[str]:
         if ticker.error:
             problems.append(f"{ticker.name}: {ticker.error}")
         elif stood_ns > max(_PERIODS * ticker.period_ns, _SHORTEST_LIMIT_NS):
-            problems.append(f"{ticker.name}: stands still for {stood_ns * 1e-9:.1f} s")
+            problems.append(f"{ticker.name}: has not run for {stood_ns * 1e-9:.1f} s")
     return problems
 
 

@@ -287,7 +287,7 @@ class Steering:
             known = None if reading.has_rate else self._body.estimation.rate_without_gyro(now_ns)
             self._has_rate = reading.has_rate or known is not None
             law.sample(reading.time_ns, reading.field, reading.rate if known is None else known)
-        text = "braking again" if current else "readings too old for detumbling: coils set to zero"
+        text = "detumbling again" if current else "readings too old for detumbling: coils set to zero"
         if current and needs_rate and not self._has_rate:
             current, text = False, "neither gyro nor estimate gives the rate: coils set to zero"
         self._facts.update(facts.CONTROL_LOST, not current, now_ns, text)

@@ -509,7 +509,7 @@ def _text(verdict: CheckResult) -> str:
     lines = [
         ("configuration", f"{verdict.path}: {config.name}, valid"),
         *(("extends", name) for name in verdict.chain[1:]),
-        ("to fly", f"body {config.body}, {config.duration:g} s"),
+        ("flight", f"body {config.body}, {config.duration:g} s"),
         ("devices", "; ".join((devices, *foreign))),
     ]
     lines += [

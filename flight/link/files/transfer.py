@@ -799,7 +799,7 @@ class Entity:
         """
         if len(self._in) >= MOST_OPEN:
             oldest = min(self._in.values(), key=lambda one: (one.unplaced, one.received_ns))
-            oldest.give_up("given up for a newer one")
+            oldest.give_up("abandoned for a newer transfer")
             self._clear()
         found = self._in[record.source, record.number] = self._receiver(record, now_ns)
         return found

@@ -483,7 +483,7 @@ def utc_of(text: str) -> int:
     time = time.replace(tzinfo=UTC) if time.tzinfo is None else time
     utc_ns = round(time.timestamp()) * SECOND_NS
     if utc_ns > HIGHEST:
-        raise CommandError(f"{text} is beyond {_utc(HIGHEST)}")
+        raise CommandError(f"{text} is too late: give a time up to {_utc(HIGHEST)}")
     return utc_ns
 
 

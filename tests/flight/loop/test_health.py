@@ -272,9 +272,9 @@ def test_a_job_on_a_ticker_fails_when_it_raises_or_stands_still() -> None:
 
     now = 10 * SECOND
     assert failing([ticker(now - 3 * SECOND)], now) == []
-    assert failing([ticker(now - 3 * SECOND - 1)], now) == ["log: stands still for 3.0 s"]
+    assert failing([ticker(now - 3 * SECOND - 1)], now) == ["log: has not run for 3.0 s"]
     assert failing([ticker(now - 2 * SECOND, period_ns=1)], now) == []
-    assert failing([ticker(now - 2 * SECOND - 1, period_ns=1)], now) == ["log: stands still for 2.0 s"]
+    assert failing([ticker(now - 2 * SECOND - 1, period_ns=1)], now) == ["log: has not run for 2.0 s"]
     assert failing([ticker(now, "disk full"), ticker(now)], now) == ["log: disk full"]
 
 

@@ -281,7 +281,7 @@ def test_a_law_gets_all_readings_and_the_currents_that_were_sent() -> None:
     law.command.assert_called_once_with(7)
     (sent,) = law.sent.call_args.args
     assert sent.tolist() == flown.asked.tolist()
-    assert flown.said["control-lost"] == (False, "braking again")
+    assert flown.said["control-lost"] == (False, "detumbling again")
     flown.body.control.tracker.reset.assert_called_once_with()
 
 

@@ -70,4 +70,4 @@ def test_a_job_that_does_not_end_is_reported_after_three_periods() -> None:
     clock.advance(4 * SECOND)
     end_ns = ticker.served_ns
     assert failing(clock.tickers, end_ns + 12 * SECOND) == []
-    assert failing(clock.tickers, end_ns + 13 * SECOND) == ["log: stands still for 13.0 s"]
+    assert failing(clock.tickers, end_ns + 13 * SECOND) == ["log: has not run for 13.0 s"]
