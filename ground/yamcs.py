@@ -379,7 +379,7 @@ def main() -> None:
         write(options.folder, options.gateway, options.http, epoch, options.keys, frame_bytes)
     except KnightCubeError as error:
         parser.error(str(error))
-    sys.stdout.write(f"Yamcs asks for user and password: {USER}, and the one in {options.folder / USERS}\n")
+    sys.stdout.write(f"Yamcs asks for user {USER} and the password in {options.folder / USERS}\n")
 
 
 PASS = "pass"

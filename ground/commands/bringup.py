@@ -273,7 +273,7 @@ def _measured(name: str, values: Mapping[str, Any]) -> str:
         case "axes":
             sizes = [f"{np.linalg.norm(turn):.0f}" for turn in values["turns_deg"]]
             turns = ", ".join(f"{axis} {size}" for axis, size in zip("xyz", sizes, strict=True))
-            text = f"turns of 90 deg measured by the gyro: {turns} deg"
+            text = f"rotations of 90 deg, measured by the gyro: {turns} deg"
         case "coils":
             fields = ", ".join(f"{value:+.2f}" for value in values["strength"])
             drawn = ("-" if None in row else f"{500.0 * sum(row):.0f}" for row in values["current"])

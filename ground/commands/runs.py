@@ -184,7 +184,7 @@ def _orbit_text(item: ObjectOrbit) -> str:
     u, v, w = 1e-3 * orbit.state[3:]
     place, speed = (float(np.sqrt(np.trace(orbit.covariance[part, part]))) for part in (_POSITION, _VELOCITY))
     lasting = (
-        "" if orbit.lasts else "  unbound or through the Earth, but not all orbits within the errors are\n"
+        "" if orbit.lasts else "  it escapes or hits the Earth, but not every orbit within its errors does\n"
     )
     return (
         f"{head}"

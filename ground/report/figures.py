@@ -769,7 +769,9 @@ def _turns(ax: Axes, outcome: Outcome) -> None:
         ax.bar(np.arange(3) + 0.27 * (index - 1), turns[:, index], 0.25, color=colour, label=name)
     ax.axhline(90.0, color=panels.VERMILLION, linestyle="--", linewidth=1.0)
     ax.set_xticks(range(3), [f"about {name}" for name in "xyz"])
-    panels.style(ax, "about x, y and z, deg", "Turns of 90 deg, measured by the gyro", "asked turn")
+    panels.style(
+        ax, "about x, y and z, deg", "Rotations of 90 deg, measured by the gyro", "requested rotation"
+    )
 
 
 def _response(ax: Axes, outcome: Outcome) -> None:

@@ -165,7 +165,7 @@ VALUES: dict[str, Any] = {
     ("name", "text"),
     [
         ("rest", "39.99 samples/s; noise (expected) 0.0003 (0.00027) rad/s, 31 (63) nT, 0.2 (0.012) m/s^2"),
-        ("axes", "turns of 90 deg measured by the gyro: x 88, y 91, z 92 deg"),
+        ("axes", "rotations of 90 deg, measured by the gyro: x 88, y 91, z 92 deg"),
         ("coils", "fields relative to the expected ones +1.00, -0.97, +0.00; supply current 110, -, 25 mA"),
         ("power", "battery 7.46 V, 0.123 A, with a coil +150 mA, bus 5.00 V, 0.200 A, with a coil -10 mA"),
         ("gps", "12 fixes, 9 satellites"),

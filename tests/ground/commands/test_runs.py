@@ -134,8 +134,8 @@ def test_orbits_are_printed_with_their_uncertainty(monkeypatch: pytest.MonkeyPat
     numbers = ("7000.000", "-1000.000", "2000.000", "300.0", "290.0", "320.0", "chi-square 12 with 14")
     for number in (*numbers, f"+- {1e-3 * place:.3g} km", f"+- {1e-3 * speed:.3g} km/s"):
         assert number in text, number
-    assert "unbound" not in text
-    assert "unbound" in runs._orbit_text(orbit(lasts=False))
+    assert "escapes" not in text
+    assert "escapes" in runs._orbit_text(orbit(lasts=False))
     monkeypatch.setattr(runs, "orbits_of", lambda _: [orbit()])
     facts = json.loads(command("orbit", flown, "--json").stdout)
     (item,) = facts["objects"]
