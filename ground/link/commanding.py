@@ -350,6 +350,7 @@ class FileSession:
         self._texts: dict[tuple[int, int], str] = {}
         self._asked: tuple[Directive, int] | None = None
         self._failed: list[tuple[Progress, int]] = []  # failed transfers, with timeouts (ns) of the reasons
+        self._earlier: set[tuple[int, int]] = set()  # transfers to the ground that were open at the request
         self._counters: set[int] = set()
         self._reports: deque[Report] = deque()
         self._unsent = b""  # packet that could not be sent yet
@@ -358,8 +359,10 @@ class FileSession:
     def ask(self, directive: Directive, now_ns: int) -> None:
         """Send a command and repeat it until the satellite answers.
 
-        Late reports on earlier commands are ignored.
+        Late reports on earlier commands are ignored, and failures of transfers that they began: the satellite
+        cancels an interrupted transfer if the file has changed since then.
         """
+        self._earlier = {(one.source, one.number) for one in self.entity.transfers() if not one.outgoing}
         self._counters.clear()
         self._reports.clear()
         self._send(directive, now_ns)
@@ -437,18 +440,19 @@ class FileSession:
         """Return whether a transfer of a file has ended, and forget all ended transfers.
 
         If `number` is given, only the transfer with this number is considered. Raises KnightCubeError with
-        the reason if the transfer has failed.
+        the reason if the transfer has failed. The satellite reports a failure of an earlier transfer that it
+        continues.
         """
         found = [one for one in self.entity.ended if one.name == name and number in {None, one.number}]
         self.entity.ended.clear()
         for one in found:
-            if one.condition != 0:
+            if one.condition != 0 and (one.source, one.number) not in self._earlier:
                 self._failed.append((one, self._credit_ns + _REASON_NS))
         for one, until in self._failed:
             # The satellite's reason is in the packet `transfer`, which may follow the end of the transfer.
             if (one.source, one.number) in self._texts or self._credit_ns >= until:
                 raise KnightCubeError(f"{one.name}: {self.reason_of(one)}")
-        return bool(found) and not self._failed
+        return any(one.condition == 0 for one in found) and not self._failed
 
     def completed(self) -> bool:
         """Return whether the satellite has completed a command.

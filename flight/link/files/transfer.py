@@ -50,6 +50,7 @@ from flight.link.files.units import (
     pack,
     unpack,
 )
+from flight.link.telemetry.log import SUFFIX
 
 MODULAR, CRC32C, CRC32, NO_CHECKSUM = 0, 2, 3, 15
 TYPES = (MODULAR, CRC32C, CRC32, NO_CHECKSUM)
@@ -663,7 +664,8 @@ class Entity:
         """Begin to send a file with a checksum of type `kind`. Raises FileError if the file cannot be sent.
 
         An open transfer of this file is resumed by sending metadata and EOF, so that the receiver requests
-        the missing ranges.
+        the missing ranges. A transfer of a file that has changed, other than by growth of a log, is
+        cancelled.
         """
         try:
             facts = path.stat()
@@ -675,9 +677,8 @@ class Entity:
             raise FileError(f"{name}: not a file, or longer than {LONGEST_FILE} bytes")
         same = self._open(str(path), name, destination)
         # A log file only grows, so its first bytes up to the announced size are unchanged.
-        if same is not None and (
-            facts.st_mtime_ns == same.record.modified_ns or facts.st_size > same.record.size
-        ):
+        grown = name.endswith(SUFFIX) and same is not None and facts.st_size > same.record.size
+        if same is not None and (grown or facts.st_mtime_ns == same.record.modified_ns):
             same.record = msgspec.structs.replace(same.record, origin=origin, suspended=False)
             self._store.save(same.record)
             same.resume()

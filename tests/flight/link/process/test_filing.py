@@ -110,6 +110,39 @@ def test_a_file_waits_for_a_line_that_takes_no_frames_and_no_part_is_sent_twice(
     link.close()
 
 
+class Undrained(FiledEnds):
+    """Both ends, whose file session alone processes the ended transfers."""
+
+    def collect(self) -> None:
+        packets = list(self.terminal.take())
+        self.packets += packets
+        self.session.take(packets, self.clock.now_ns())
+        self.session.transmit(self.clock.now_ns())
+
+
+def test_a_list_that_has_grown_since_an_interrupted_transfer_is_received_as_it_is_now(tmp_path: Path) -> None:
+    link = Undrained(tmp_path, rate=2e3)
+    link.record(*timing_packets(10))
+    for n in range(90):
+        (link.place / f"runs/run-000001/{n}.txt").touch()
+    link.ask(ListFiles())
+    while not link.session.entity.transfers():
+        link.turn(0.02)
+    link.session.entity.keep(0, at_once=True)
+    link.wire.takes, link.wire.listened = 0, False
+    link.turn(2.0)
+    assert link.station.transfers == len(link.session.entity.transfers()) == 1
+    (link.place / "runs/run-000001/later.ccsds").write_bytes(b"later")
+    link.restart()
+    link.wire.takes, link.wire.listened = None, True
+    link.ask(ListFiles())
+    while not link.session.received_file(LISTING):
+        link.turn(0.02)
+    listing = json.loads((link.session.received / LISTING).read_bytes())
+    assert "log/run-000001/later.ccsds" in [file["name"] for file in listing["files"]]
+    link.close()
+
+
 @pytest.mark.parametrize("listened", [True, False])
 def test_an_uplinked_file_is_stored_while_the_satellite_cannot_send(link: FiledEnds, listened: bool) -> None:
     link.wire.takes, link.wire.listened = 0, listened
