@@ -528,7 +528,7 @@ class Transmitter:
                 due = self._downlink.frames(now_ns, live_only=not self._listened)
             except KnightCubeError as error:  # commands are accepted, such as a command that sets a new key
                 problem = str(error)
-        frames = self._unsent or due
+        frames = self._unsent + due
         counts = {line.name: line.send(frames, now_ns) for line in self._lines}
         taken = [count for count in counts.values() if count is not None]
         self.untaken += sum(len(frames) - count for count in taken)

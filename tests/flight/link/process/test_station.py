@@ -450,6 +450,20 @@ def test_a_line_that_takes_nothing_is_reported_once_and_loses_no_report(link: Bo
     assert link.station.unreported == 0
 
 
+def test_no_report_on_the_first_commands_of_a_contact_is_lost(link: BothEnds) -> None:
+    """The line accepted no more frames at the end of the last contact, so frames of that time are left."""
+    link.turn(1.0)
+    link.wire.takes = 0
+    link.record(*timing_packets(100))
+    link.turn(0.5)
+    link.wire.takes, link.wire.listened = None, False
+    link.turn(60.0)
+    link.wire.listened = True
+    counters = [link.terminal.send(packet(Ping(n))) for n in range(8)]
+    link.turn(1.0)
+    assert all("accepted" in link.stages(counter) for counter in counters)
+
+
 def test_a_line_that_is_slow_is_not_reported_and_carries_the_status_once_a_second(tmp_path: Path) -> None:
     """A radio of 960 bytes/s needs 1.3 s for a coded frame of 1115 bytes."""
     coding, said, turns = LinkCoding(reed_solomon=5), list[str](), iter([False] * 5_000)
