@@ -342,7 +342,10 @@ class Store:
 
         The number is at least the UTC in seconds, so that it is new even if the last number was lost.
         """
-        self._write_numbers(max(self.last + 1, utc_ns // 10**9) & HIGHEST_NUMBER or 1, self.endings)
+        seconds = (
+            max(utc_ns, 0) // 10**9 & HIGHEST_NUMBER
+        )  # a wrong clock can show a time after the year 2106
+        self._write_numbers(max(self.last + 1, seconds) & HIGHEST_NUMBER or 1, self.endings)
         return self.last
 
     def add_ending(self, ending: Ending) -> None:

@@ -167,6 +167,15 @@ def test_numbers_outlive_a_restart_and_the_loss_of_their_record(tmp_path: Path, 
     assert Store(tmp_path / "s").new_number(60 * 10**9) == 60
 
 
+def test_numbers_do_not_repeat_under_a_clock_beyond_their_range(tmp_path: Path) -> None:
+    """The numbers have 32 bits, and the UTC of a wrong clock reaches the year 2262."""
+    folder = Store(tmp_path)
+    given = [folder.new_number(utc_ns) for utc_ns in (2**63 - 1, 2**63 - 1, 5 * 10**9)]
+    assert len({*given}) == 3
+    assert folder.new_number((2**32 - 1) * 10**9) == 2**32 - 1
+    assert [folder.new_number(utc_ns) for utc_ns in (0, -(10**9))] == [1, 2]
+
+
 @pytest.mark.parametrize(
     "name",
     [
