@@ -281,7 +281,7 @@ WORKER_RESTS = _fault(
     49,
     "worker-rests",
     "a worker died too often in a row and is restarted after some minutes",
-    "read the journal and the memory of the board; the worker is started again after some minutes",
+    "read the journal, and check memory and load of the board",
 )
 CAMERA_LOST = _warn(
     50,
@@ -312,7 +312,7 @@ VISION_FAILED = _warn(
     54,
     "vision-failed",
     "vision found no result; the text gives the reason",
-    "none for single frames; otherwise remove the reason in the text",
+    "none for single frames; otherwise remove the cause in the text",
 )
 STREAK_REFUSED = _warn(
     55,
@@ -335,7 +335,7 @@ CAMERA_TORN = _warn(
 CAMERA_STRANGE = _warn(
     58,
     "camera-strange",
-    "many stars were detected but none match the catalogue: check the camera's pixels",
+    "many stars were detected but none match the catalogue",
     "check pixels, field of view and orientation with `knightcube solve` and `calibrate`",
 )
 VISION_SLOW = _warn(
@@ -479,7 +479,7 @@ RETURNED = _warn(
     150,
     "returned",
     "the board returned to an earlier release or configuration; the text gives the reason",
-    "correct the reason in the text, and renew again",
+    "remove the cause in the text, and renew again",
 )
 COMMANDED = _info(80, "commanded", "a command was executed")
 COMMAND_REFUSED = _warn(
@@ -533,7 +533,7 @@ GPS_REFUSED = _warn(
     103,
     "gps-refused",
     "a GPS fix was refused; the text gives the reason",
-    "none for single fixes; if all are refused, the text gives the reason: renew old elements",
+    "none for single fixes; if all are refused, remove the cause in the text, such as old elements",
 )
 GPS_SET_UP = _warn(
     153,
@@ -557,7 +557,7 @@ STRINGS_LOST = _warn(
     104,
     "strings-lost",
     "the solar strings deliver no readings",
-    "none in orbit: the flight continues without it; on a bench, check bus and address of the converter",
+    "none in orbit: the flight continues without them; on a bench, check bus and address of the converter",
 )
 STRINGS_RECOVERED = _info(105, "strings-recovered", "the solar strings deliver readings again")
 SUN_UNCLEAR = _warn(
