@@ -37,7 +37,7 @@ Every packet is a CCSDS space packet (133.0-B-2) with big-endian numbers:
 |---|---|---|
 | 0 | u2 | version 0 (3 bits), type 0 = telemetry (1), secondary header 1 (1), APID (11) |
 | 2 | u2 | 3 = unsegmented (2 bits), sequence count of this APID (14) |
-| 4 | u2 | bytes that follow this word, less one |
+| 4 | u2 | bytes that follow this word, minus one |
 | 6 | u1 | version of the packet's definition |
 | 7 | i8 | mission time, ns |
 | 15 | | the fields below |
@@ -61,7 +61,7 @@ Every telecommand is a CCSDS space packet (133.0-B-2) with big-endian numbers:
 |---|---|---|
 | 0 | u2 | version 0 (3 bits), type 1 = telecommand (1), secondary header 1 (1), APID (11) |
 | 2 | u2 | 3 = unsegmented (2 bits), sequence count, chosen by the sender and repeated in the report (14) |
-| 4 | u2 | bytes that follow this word, less one |
+| 4 | u2 | bytes that follow this word, minus one |
 | 6 | u1 | version of the packet's definition |
 | 7 | i8 | time of the command by the sender's clock, ns since 1970 UTC |
 | 15 | | the fields below |

@@ -184,7 +184,7 @@ class Deletion(_Directive):
         "unschedule",
         0x221,
         "Delete a scheduled command",
-        Field("number", "u4", "-", "its number; 0 deletes all"),
+        Field("number", "u4", "-", "number of the command in the list; 0 deletes all"),
     )
 
     def __str__(self) -> str:

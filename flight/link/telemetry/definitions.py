@@ -278,7 +278,7 @@ _DRAWN = "%s; positive while the battery discharges"
 POWER = _packet(
     "power",
     0x134,
-    "1 Hz, only with a section power",
+    "1 Hz, only with the section `power`",
     "Battery and bus: measurements, state of charge and shed loads; NaN if unknown",
 )(
     Field("shed", "u1", "-", "loads that are shed", states=SHED, alarms=SHED_ALARMS),
@@ -393,7 +393,7 @@ TRUTH = _packet(
 TRUE_POWER = _packet(
     "true_power",
     0x145,
-    "1 Hz, simulation only, only with a section power",
+    "1 Hz, simulation only, only with the section `power`",
     "True power system, which sim_hal writes",
 )(
     Field("charge", "f4", "-", "state of charge"),
