@@ -400,7 +400,7 @@ def _check_length(dotted: str, quaternion: Quaternion, refuse: Refuse) -> None:
 
 # Largest noise of a gyro (rad/s) and of an attitude (rad), and largest range of a magnetometer (T).
 _MOST_OF_UNIT = {
-    "rate_noise": (0.2, "rad/s", "deg/s", math.pi / 180.0),
+    "rate_noise": (0.02, "rad/s", "deg/s", math.pi / 180.0),
     "angle_noise": (0.5, "rad", "deg", math.pi / 180.0),
     "field_range": (0.01, "T", "uT", 1e-6),
 }

@@ -9,6 +9,7 @@ running flight uses are reported as busy.
 from __future__ import annotations
 
 import argparse
+import math
 import os
 import sys
 import tempfile
@@ -18,6 +19,8 @@ from contextlib import ExitStack, suppress
 from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TextIO
+
+import numpy as np
 
 from flight.app.cli import PROGRAM, complain, to_json
 from flight.app.devices import (
@@ -30,6 +33,8 @@ from flight.app.devices import (
     real_rig,
 )
 from flight.app.run import RunRequest, RunResult
+from flight.link.telemetry.log import find_segments
+from flight.link.telemetry.packets import LAYOUTS, walk
 from flight.schema import reader as configuration
 from flight.schema.bodies import OrbitConfig
 from flight.schema.devices import (
@@ -441,8 +446,49 @@ def _fly(verdict: CheckResult) -> None:
     duration, begun = min(FLOWN_S, verdict.config.duration), time.perf_counter()
     with tempfile.TemporaryDirectory(prefix="knightcube-check-") as folder:
         verdict.result = fly(RunRequest(verdict.path, Path(folder) / "run", duration=duration, trial=True))
-    verdict.elapsed = time.perf_counter() - begun
+        verdict.elapsed = time.perf_counter() - begun
+        if not verdict.result.faults:
+            problems, warnings = gyro_units(verdict.config, Path(folder) / "run")
+            verdict.problems += problems
+            verdict.warnings += warnings
     verdict.problems += flight_problems(verdict.result)
+
+
+_DEGREE = 180.0 / math.pi
+
+
+def gyro_units(config: Config, folder: Path) -> tuple[list[str], list[str]]:
+    """Return problems and warnings about the gyro's unit: logged rates are compared with simulated rates.
+
+    It is a problem if a driver returns deg/s, or multiplies rad/s by pi / 180. Such a driver is not found if
+    the body is almost at rest. The warning is that the noise of the gyro is probably configured in deg/s.
+    """
+    imu, truth = _rows(folder, "flight", "imu"), _rows(folder, "truth", "truth")
+    imu = imu[np.isfinite(imu["rate"]).all(axis=1)]
+    if len(imu) < 2 or len(truth) < 2:
+        return [], []
+    times = imu["sample_time_ns"].astype(float)
+    true = np.stack([np.interp(times, truth["time_ns"], rate) for rate in truth["rate"].T], axis=1)
+    square = float((true * true).sum())
+    scale = float((imu["rate"] * true).sum()) / square if square > 0.0 else math.nan
+    left = imu["rate"] - scale * true
+    noise = float(np.median(np.std(left, axis=0)))
+    for factor in (_DEGREE, 1.0 / _DEGREE):
+        if abs(scale / factor - 1.0) < 0.2 and 5.0 * noise < 0.2 * factor * math.sqrt(square):
+            found = f"the gyro of `inertial_unit` measures {scale:.3g} times the simulated rate"
+            return [f"{found}: its driver must return rad/s, and convert deg/s once"], []
+    stated = config.inertial_unit.rate_noise
+    if abs(stated / max(noise, 1e-9) / _DEGREE - 1.0) < 0.3:
+        found = f"`inertial_unit.rate_noise` is {stated:g}, and the simulated gyro has {noise:.2g} rad/s"
+        return [], [f"{found}: give rad/s, not deg/s"]
+    return [], []
+
+
+def _rows(folder: Path, stem: str, name: str) -> Any:
+    """Return the packets called `name` of a log as a structured array."""
+    data = b"".join(path.read_bytes() for path in find_segments(folder, stem))
+    layout = LAYOUTS[name]
+    return layout.array(b"".join(data[begin:end] for kind, begin, end in walk(data) if kind == layout))
 
 
 def flight_problems(result: RunResult) -> list[str]:

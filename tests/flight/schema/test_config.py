@@ -492,7 +492,7 @@ def test_a_mistake_in_the_coils_gets_one_line(wrong: str, complaint: str) -> Non
             "{axis: [0, 0, 1], dipole_per_ampere: 0.648, resistance: 0.023}",
             r"resistance` is 0.023: .* A:",
         ),
-        ("rate_noise: 2.8e-4", "rate_noise: 20", r"rate_noise` is 20: .* 0.2: .* 20 deg/s are 0.349 rad/s"),
+        ("rate_noise: 2.8e-4", "rate_noise: 20", r"rate_noise` is 20: .* 0.02: .* 20 deg/s are 0.349 rad/s"),
         ("rate_noise: 2.8e-4", "angle_noise: 2", r"angle_noise` is 2: .* 2 deg are 0.0349 rad"),
         ("field_range: 2.5e-4", "field_range: 250", r"field_range` is 250: .* 250 uT are 0.00025 T"),
         (

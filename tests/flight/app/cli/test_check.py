@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import subprocess
 import sys
 import time
@@ -121,6 +122,69 @@ def test_a_satellite_without_a_sensor_of_its_attitude_is_ready_with_a_warning(tm
     assert done.stdout.endswith("verdict:       ready, with warnings: see above\n")
     path = write(tmp_path, SATELLITE, **blind, targets=[{"at": 0.0, "point": "sun"}])
     assert json.loads(command("check", path, "--json").stdout)["warnings"] == [], "the solar strings suffice"
+
+
+SENSOR = """
+import struct
+
+class Sensor:
+    def __init__(self, i2c, address):
+        self.i2c, self.address = i2c, address
+
+    def vector(self, register):
+        data = bytearray(12)
+        self.i2c.writeto_then_readfrom(self.address, bytes((register,)), data)
+        return struct.unpack("<3f", data)
+
+    gyro = property(lambda self: tuple(SCALE * value for value in self.vector(0)))
+    magnetic = property(lambda self: tuple(1e6 * value for value in self.vector(1)))
+
+class Chip:
+    def __init__(self, measured, sensor):
+        self.measured, self.address, self.register = measured, sensor.address, 0
+
+    def answers(self, address):
+        return address == self.address
+
+    def write(self, address, data):
+        self.register = data[0]
+
+    def read(self, count):
+        quantity, noise = (("gyro", 2e-4), ("magnetic", 2e-7))[self.register]
+        return struct.pack("<3f", *self.measured.of(quantity, noise))
+"""
+
+
+@pytest.mark.parametrize(
+    ("scale", "stated", "problem", "warning"),
+    [
+        (1.0, 2e-4, "", ""),
+        (57.29578, 2e-4, "measures 57.* times the simulated rate: its driver must return rad/s", ""),
+        (0.0174533, 2e-4, "measures 0.017. times the simulated rate: its driver must return rad/s", ""),
+        (1.0, 0.0115, "", "rate_noise` is 0.0115, and the simulated gyro has 0.00.* rad/s: give rad/s"),
+    ],
+    ids=["rad/s", "deg/s", "converted twice", "noise in deg/s"],
+)
+def test_a_gyro_in_degrees_is_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, scale: float, stated: float, problem: str, warning: str
+) -> None:
+    monkeypatch.syspath_prepend(str(tmp_path))
+    monkeypatch.delitem(sys.modules, "degrees", raising=False)
+    (tmp_path / "degrees.py").write_text(f"SCALE = {scale}\n{SENSOR}", encoding="utf-8")
+    part = {"part": "degrees:Sensor", "emulator": "degrees:Chip", "address": 0x30}
+    sensors = [{**part, "measures": {"gyro": list("xyz"), "magnetic": list("xyz")}}]
+    unit = {"driver": "sensors", "rate_hz": 40, "angle_noise": 1e-3, "rate_noise": stated, "sensors": sensors}
+    path = write(
+        tmp_path, SATELLITE, inertial_unit=unit, camera="none", wide_cameras=[], duration=2.0,
+        targets=[{"at": 0.0, "point": "sun"}],
+    )  # fmt: skip
+    done = command("check", path, "--json")
+    facts = json.loads(done.stdout)
+    assert "problems" in facts, done.stderr
+    for found, pattern in ((facts["problems"], problem), (facts["warnings"], warning)):
+        named = [text for text in found if "inertial_unit" in text]
+        assert len(named) == bool(pattern)
+        assert not pattern or re.search(pattern, named[0])
 
 
 def test_a_simulation_that_does_not_fly_well_is_not_ready(tmp_path: Path) -> None:
