@@ -212,7 +212,7 @@ def test_the_text_states_each_constant_with_its_uncertainty_and_its_configured_v
 def test_the_text_warns_of_coloured_innovations_and_of_a_field_that_was_not_measured() -> None:
     text = identify._text(made(white=False, field=False))
     assert "the innovations are NOT white: the errors are increased accordingly\n" in text
-    assert "field:  not measured because the coils were never off long enough, or the field did not" in text
+    assert "field:  as configured; not measured because the coils were never off long enough, or" in text
     assert "75 % prior, 25 % motion with inertia and dipole" in text
 
 

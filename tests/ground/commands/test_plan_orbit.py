@@ -68,7 +68,7 @@ def test_a_target_behind_the_earth_is_named(side: float) -> None:
     assert done.returncode == 0, done.stderr
     assert ("the Earth hides it" in done.stdout) == (side < 0.0)
     line = next(line for line in done.stdout.splitlines() if line.startswith("target:"))
-    assert side * float(line.split("ends ")[1].split(" deg")[0]) > 80.0
+    assert side * float(line.split("satellite ")[1].split(" deg")[0]) > 80.0
 
 
 def test_each_axis_has_the_dipole_limit_of_its_own_coil(tmp_path: Path) -> None:
