@@ -469,6 +469,8 @@ def _may_be_defocused(solution: FrameSolution, motion: FrameMotion, tracker: Tra
     lowest, highest = tracker.scale
     if solution.kind is not FrameKind.POINTS or lowest != highest or tracker.solve.method is not None:
         return False
+    if solution.torn:
+        return False
     if solution.fix is None or motion.status is StreakStatus.FAILED or _scatter(solution) > _SCATTERED_PX:
         return True
     return _direction_sigma(solution.fix) * solution.camera.focal_length > _UNCERTAIN_PX

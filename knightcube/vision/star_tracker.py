@@ -310,10 +310,11 @@ class StarTracker:
         found = found_in_image(image, camera, scale, seconds, sky, settings, attitudes, rates, self.lens)
         self.lens, frame = found.lens, found.solution
         assert frame is not None  # the job contains the settings of the star tracker
-        few = frame.fix is None or frame.faint
+        few = (frame.fix is None and not frame.torn) or frame.faint
         if few and exposure is None and self._camera is None and not self._learn:
             coarse = self._solved_coarser(image, sky, settings)
-            frame = frame if coarse is None or len(coarse.matched) < len(frame.matched) else coarse
+            if coarse is not None and (coarse.torn or len(coarse.matched) >= len(frame.matched)):
+                frame = coarse
         if frame.status is SolveStatus.NO_MATCH and scale[0] < scale[1]:
             low, high = (math.degrees(field_of_view(camera.rescaled(1.0 / limit))) for limit in scale)
             searched = f"fields of view of {low:.3g} to {high:.3g} deg were searched"
@@ -322,7 +323,7 @@ class StarTracker:
         return solution if found.turn is None or not solution else _turned(solution, conjugate(found.turn))
 
     def _solved_coarser(self, image: Image, sky: SkyIndex, settings: SolveSettings) -> FrameSolution | None:
-        """Return the solution of a large image after binning, or None if no binned image is solved.
+        """Return the solution of a large image after binning, or None if no binned image is solved or torn.
 
         The stars of large photographs are often several pixels wide. Compression or interpolation correlates
         the noise of neighbouring pixels, so that the computed uncertainties are too small.
@@ -335,7 +336,9 @@ class StarTracker:
             camera, scale = camera_of_field(self._fov_deg, self._fov_error_deg, coarse.shape)
             binned = binned_settings(settings, size)
             found = found_in_image(coarse, camera, scale, 1.0, sky, binned).solution
-            if found is not None and found.fix is not None and found.kind is FrameKind.POINTS:
+            if found is None or found.kind is not FrameKind.POINTS:
+                continue
+            if found.fix is not None or found.torn:
                 return in_whole_image(found, bins, image.shape)
         return None
 

@@ -33,6 +33,7 @@ from knightcube.vision.startracker.index import SkyIndex
 from knightcube.vision.startracker.lost_in_space import IdentificationSettings, identify
 from knightcube.vision.startracker.sky_map import BENDS, ShortTrails, SkyMap, apparent, known_bend, usual_bend
 from knightcube.vision.startracker.survey import DetectionSettings, FrameKind, accepted_psf
+from knightcube.vision.startracker.torn_frames import at_another_attitude, displacement
 from knightcube.vision.startracker.tracking import PRIOR_SIGMAS, track
 from knightcube.vision.startracker.verification import expected_stars
 from knightcube.vision.streaks.geometry import PIXEL_VARIANCE, Course
@@ -82,6 +83,7 @@ class FrameSolution:
             image after it is flipped left to right at the optical axis. The points of a solution are those
             of the original image even for a mirrored sky.
         psf_sigma: measured standard deviation of the point spread, px; NaN if unknown.
+        torn: whether a part of the rows is displaced, or shows another attitude.
     """
 
     status: SolveStatus
@@ -102,6 +104,7 @@ class FrameSolution:
     motion: MotionResult | None = None
     mirrored: bool = False
     psf_sigma: float = math.nan
+    torn: bool = False
 
     @property
     def matched(self) -> IntArray:
@@ -236,6 +239,14 @@ _LEAST_RADIUS_PX, _MOST_RADIUS_PX = 3.0, 15.0
 _COMPANION_ROUNDS = 3
 # Distance (PSF widths) up to which an unresolved star can displace another one.
 _COMPANION_REACH = 8.0
+# Fraction of the matched points that are brighter than the faintest point that may show another attitude.
+_BRIGHT_SHARE = 0.9
+# Number of such points, without a matched point between their rows, for which another attitude is searched.
+_NEIGHBOURS = 4
+# Chi-square of a star, and number of such stars, above which a displaced part of the rows is searched.
+_OUTLIER, _FEWEST_OUTLIERS = 12.0, 4
+# Displacement (px) of a part of the rows above which an attitude is refused.
+_LARGE_STEP_PX = 2.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -298,7 +309,7 @@ def solve_points(
         found.points, found.covariance, FrameKind.POINTS, camera, scale, sky, settings, prior, found.flux
     )
     solution = _beside_companions(solution, found, camera, scale, sky, settings)
-    return _shape_unknown(solution, found, settings)
+    return _in_one_piece(_shape_unknown(solution, found, settings), found.flux, sky, prior)
 
 
 def solve_faint(
@@ -395,7 +406,8 @@ def solve_motion(
         return solution
     covariance = solution.fix.covariance + timing_covariance(motion)
     fix = replace(solution.fix, covariance=covariance)
-    return replace(solution, fix=fix, psf_sigma=motion.psf_sigma)
+    solution = replace(solution, fix=fix, psf_sigma=motion.psf_sigma)
+    return _in_one_piece(solution, motion.flux[chosen], sky, prior)
 
 
 def points_near(
@@ -450,7 +462,7 @@ def solve_near(
         return None
     solution = _with_attitude(seen, near, sky, settings)
     solution = _beside_companions(solution, found, camera, scale, sky, settings)
-    solution = _shape_unknown(solution, found, settings)
+    solution = _in_one_piece(_shape_unknown(solution, found, settings), found.flux, sky, prior)
     return solution if _agrees(solution, prior) else None
 
 
@@ -550,6 +562,61 @@ def _shape_unknown(solution: FrameSolution, found: Detections, settings: SolveSe
     # The measured width includes the averaging over a pixel; the variance due to averaging is subtracted.
     psf_sigma = math.sqrt(max(measured**2 - PIXEL_VARIANCE, 0.0))
     return replace(solution, psf_sigma=psf_sigma).wider(np.diag([doubt**2, doubt**2, 0.0]))
+
+
+def _in_one_piece(
+    solution: FrameSolution, flux: FloatArray, sky: SkyIndex, prior: AttitudePrior | None
+) -> FrameSolution:
+    """Return the solution; the attitude is refused or less certain if a part of the rows is displaced.
+
+    See `torn_frames`. The argument `flux` contains the flux (n,) of each point. Stars at another attitude
+    that contradicts the prior do not make the attitude ambiguous.
+    """
+    if solution.fix is None:
+        return solution
+    seen = _mirrored(solution) if solution.mirrored else solution
+    camera, matched = seen.camera, seen.matched
+    residual, rows = seen.points[matched] - seen.expected[matched], seen.points[matched, 1]
+    # A displacement is searched only if several stars have large residuals.
+    squares = 2.0 * np.sum(residual**2, axis=1) / np.trace(seen.covariance[matched], axis1=1, axis2=2)
+    step, count, fitted = np.zeros(2), 0, bool(seen.bend.any())
+    if np.count_nonzero(squares > _OUTLIER) >= _FEWEST_OUTLIERS:
+        step = displacement(seen.points[matched], residual, seen.covariance[matched], camera, fitted)
+    rest = np.flatnonzero(seen.star < 0)
+    rest = rest[rest < matched[int(_BRIGHT_SHARE * (len(matched) - 1))]]
+    if _has_neighbours(rows, seen.points[rest, 1]):
+        part = replace(seen, points=seen.points[rest], covariance=seen.covariance[rest])
+        stars = star_field(part, flux[rest], (1.0, 1.0))
+        known = None if prior is None else (prior.quaternion, prior.sigma)
+        count = at_another_attitude(part.points, stars, rows, camera, solution.fix, sky, known, fitted)
+    if not count and math.hypot(*step) < _LARGE_STEP_PX:
+        about = 2.0 * math.hypot(*step) / max(camera.columns, camera.rows)
+        turn = np.array([step[1] / camera.focal_length, -step[0] / camera.focal_length, 0.0])
+        doubt = np.outer(turn, turn) + np.diag([0.0, 0.0, about**2])
+        return replace(solution.wider(doubt), torn=bool(step.any()))
+    reason = "the stars of other rows are displaced"
+    if count:
+        reason = f"{count} stars in other rows show another attitude"
+    unsolved = FrameSolution(
+        SolveStatus.AMBIGUOUS,
+        f"{len(matched)} stars show one attitude, but {reason}: a part of the image is displaced or from "
+        "another exposure",
+        solution.kind,
+        camera,
+        solution.points,
+        solution.covariance,
+    )
+    return replace(unsolved, motion=solution.motion, torn=True)
+
+
+def _has_neighbours(rows: FloatArray, others: FloatArray) -> bool:
+    """Return whether several unmatched points are next to each other in the order of the rows.
+
+    The arguments are the rows of the matched points (n,) and of the unmatched points (m,).
+    """
+    owner = np.repeat([0, 1], [len(rows), len(others)])[np.argsort(np.append(rows, others), kind="stable")]
+    sums = np.cumsum(np.append(np.zeros(_NEIGHBOURS, dtype=np.int64), owner))
+    return bool(np.any(sums[_NEIGHBOURS:] - sums[:-_NEIGHBOURS] == _NEIGHBOURS))
 
 
 def _identify(
