@@ -17,6 +17,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from flight.app.run import RunRequest
+from flight.link.commands import event_problem
 from flight.loop.state import state_folder
 from flight.schema.bodies import OrbitConfig
 from flight.schema.devices import (
@@ -259,7 +260,10 @@ def _dated(rig: Rig, config: Config) -> Rig:
 
 
 def check_settings(config: Config) -> None:
-    """Raise ConfigError, with the permitted range, for a value that a driver does not accept."""
+    """Raise ConfigError for a value that a driver does not accept, and for an unknown event to clear."""
+    for index, step in enumerate(config.commands.timeline):
+        if step.clear is not None and (problem := event_problem(step.clear)):
+            raise ConfigError(f"commands.timeline[{index}].clear", f"is {step.clear!r}, which {problem}")
     for name, kind, section in fitted_devices(config):
         try:
             driver_of(kind, section, f"{name}.driver").check(section)

@@ -13,6 +13,7 @@ that the filter can inspect begin with the UDP header for UDP sockets, and with 
 
 from __future__ import annotations
 
+import difflib
 import math
 import os
 import socket
@@ -27,7 +28,7 @@ from ipaddress import IPv4Address, IPv4Network
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
 
-from flight.link.events import COMMANDABLE, Mode
+from flight.link.events import COMMANDABLE, EVENTS, Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS, PARAMETER_KEYS, Field, Packet
 from flight.link.telemetry.packets import (
     HEADER_BYTES,
@@ -346,8 +347,16 @@ def check(packet: Packet, fields: Mapping[str, Any]) -> None:
         if field.valid is not None and not field.valid[0] <= value <= field.valid[1]:  # NaN compares false
             low, high = field.valid
             raise CommandError(f"{field.name} = {value} must lie within {low:g} to {high:g}")
-    if packet is CLEAR and not fields["event"]:
-        raise CommandError("clear needs the name of an event")
+    if packet is CLEAR and (problem := event_problem(fields["event"])):
+        raise CommandError(f"clear: {shown(fields['event'])!r} {problem}")
+
+
+def event_problem(name: str) -> str:
+    """Return why `name` is not the name of an event, with the most similar name, or "" for an event."""
+    names = [kind.name for kind in EVENTS]
+    close = difflib.get_close_matches(name, names, n=1)
+    cure = f"did you mean {close[0]}?" if close else "use a name of the page Events"
+    return "" if name in names else f"is not the name of an event: {cure}"
 
 
 class CommandPacker:

@@ -20,7 +20,7 @@ import numpy as np
 
 from flight.app.run import utc_ns
 from flight.link import commands
-from flight.link.events import EVENTS, Mode
+from flight.link.events import Mode
 from flight.link.files.store import FileError, Store, problem_of_name
 from flight.link.process import directives
 from flight.link.process.commanding import Report, Stage, utc_of
@@ -139,8 +139,8 @@ class CommandForms:
         """Raise UsageError or CommandError for values that the body or the command schedule refuses."""
         if name == commands.MODE.name and (mode := Mode(fields["mode"])) in foreign_modes(self.body):
             raise UsageError(f"mode {mode.label}: this body has no such mode")
-        if name == commands.CLEAR.name and fields["event"] not in {kind.name for kind in EVENTS}:
-            raise UsageError(f"clear: {fields['event']!r} is not the name of an event")
+        if name == commands.CLEAR.name and (problem := commands.event_problem(fields["event"])):
+            raise UsageError(f"clear: {fields['event']!r} {problem}")
         if name == SCHEDULE.name:
             if utc_of(fields["at"]) <= utc_ns():
                 raise UsageError(f"schedule: {fields['at']} has passed")

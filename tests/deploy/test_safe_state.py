@@ -45,7 +45,7 @@ def test_packets_of_the_safe_state_agree_with_the_tables() -> None:
         (ChangeMode(Mode.HOLD), 1, 110.0, "mode: safe state, start 1 of the flight software in 0 s"),
         (ChangeMode(Mode.SAFE), 1, 3710.0, "safe: safe state, start 1 of the flight software in 3600 s"),
         (Slew(0.1), 0, 130.0, "the board is in its safe state and executes only ping, safe and mode"),
-        (Clear("x"), 0, 130.0, "the board is in its safe state and executes only ping, safe and mode"),
+        (Clear("too-hot"), 0, 130.0, "the board is in its safe state and executes only ping, safe and mode"),
     ],
 )
 def test_a_command_is_answered_once_and_mode_tries_the_flight(

@@ -25,7 +25,7 @@ from flight.link.commands import (
     Slew,
     unpack,
 )
-from flight.link.events import Mode
+from flight.link.events import EVENTS, Mode
 from flight.link.telemetry.definitions import PARAMETER_FIELDS
 from flight.link.telemetry.packets import LAYOUTS as TELEMETRY
 from flight.link.telemetry.packets import crc16
@@ -60,7 +60,7 @@ ANY: st.SearchStrategy[Command] = st.one_of(
         st.integers(0, 2**32 - 1),
         st.tuples(*(st.floats(*field.valid) for field in PARAMETER_FIELDS if field.valid)),
     ),
-    st.builds(Clear, st.text(st.characters(codec="ascii", exclude_characters="\0"), min_size=1, max_size=31)),
+    st.builds(Clear, st.sampled_from([kind.name for kind in EVENTS])),
 )
 
 
@@ -104,7 +104,9 @@ def test_a_command_is_a_ccsds_telecommand_and_no_telemetry() -> None:
         (Slew(-math.inf), "within"),
         (ChangeMode(Mode.BOOT), "mode = 0 cannot be commanded"),
         (ChangeMode(Mode.SLEW), "mode = 4 cannot be commanded"),
-        (Clear(""), "name of an event"),
+        (Clear(""), "'' is not the name of an event"),
+        (Clear("coil-brokn"), "'coil-brokn' is not the name of an event: did you mean coil-broken?"),
+        (Clear("zzzz"), "'zzzz' is not the name of an event: use a name of the page Events"),
         (Ping(-1), "number = -1"),
     ],
 )

@@ -291,11 +291,11 @@ def test_clearing_a_broken_coil_makes_the_drive_trust_its_coils_again() -> None:
     bench = Bench()
     bench.facts.update(facts.COILS_BROKEN[1], True, 0, "no current")
     bench.facts.update(facts.TASK_FAILING, True, 0, "often")
-    bench.run(9 * S, Clear("no-such-event"))
+    bench.run(9 * S, Clear("camera-lost"))
     refused = bench.records[-1]
     assert refused["obeyed"] == 0
     named = f"{events.TASK_FAILING.name}, {events.COIL_BROKEN.name}"
-    assert refused["text"].endswith(f"no event is latched as 'no-such-event'; latched: {named}")
+    assert refused["text"].endswith(f"no event is latched as 'camera-lost'; latched: {named}")
     bench.run(10 * S, Clear(events.TASK_FAILING.name))
     assert bench.records[-1]["obeyed"] == 1
     assert [call[0] for call in bench.calls] == ["run"]

@@ -385,6 +385,11 @@ def test_the_devices_of_an_orbit_are_looked_for_too(unit: Path, tmp_path: Path) 
         ({"body": "nobody"}, "`body` is 'nobody'"),
         ({"duration": -1.0}, "duration"),
         ({"surplus": 1}, "surplus"),
+        (
+            {"commands": {"timeline": [{"at": 1.0, "clear": "coil-brokn"}]}},
+            "`commands.timeline[0].clear` is 'coil-brokn', which is not the name of an event: did you mean "
+            "coil-broken?",
+        ),
     ],
 )
 def test_a_configuration_that_is_refused_is_one_line_and_status_2(
