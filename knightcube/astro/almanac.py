@@ -16,10 +16,16 @@ from numpy.typing import ArrayLike
 from knightcube.astro.arrays import FloatArray, brief, check_numbers, finite_array
 from knightcube.astro.earth import geomagnetism
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER
-from knightcube.astro.earth.orbit_knowledge import LOWEST_RADIUS, elements_of, propagated
+from knightcube.astro.earth.orbit_knowledge import (
+    FARTHEST,
+    FASTEST,
+    LONGEST,
+    LOWEST_RADIUS,
+    elements_of,
+    propagated,
+)
 from knightcube.astro.earth.orientation import julian_epoch, terrestrial_time
 from knightcube.astro.earth.sun import (
-    DAY,
     SPEED_OF_LIGHT,
     Shadow,
     earth_from_sun,
@@ -35,11 +41,6 @@ _FARTHEST = 10.0 * EARTH_RADIUS
 """Largest distance (m) from the Earth's centre at which the field is that of the Earth's core.
 
 The magnetopause is at about ten Earth radii on the day side.
-"""
-_LONGEST = 30.0 * DAY
-"""Longest time (s) over which an orbit is propagated from one state.
-
-The unknown drag displaces a satellite in a low orbit by hundreds to thousands of kilometres in 30 days.
 """
 
 
@@ -273,10 +274,14 @@ def propagate_orbit(
         seconds: (n,) times relative to the initial state, s, in any order; at most 30 days.
 
     Raises:
-        ArgumentError: if a value is not finite, if the orbit intersects the Earth (as a state in km does), or
-            if a time is more than 30 days from the initial state.
+        ArgumentError: if a value is not finite, if the orbit intersects the Earth (as a state in km does), if
+            the position or the velocity is larger than that of a satellite of the Earth, or if a time is more
+            than 30 days from the initial state.
     """
     at, motion = _single_position(position), finite_array("velocity", velocity, (3,))
+    for name, vector, most, unit in (("position", at, FARTHEST, "m"), ("velocity", motion, FASTEST, "m/s")):
+        if (length := math.hypot(*vector.tolist())) > most:
+            raise ArgumentError(name, f"{length:g} {unit}: give at most {most:g} {unit}")
     lowest = _perigee(at, motion)
     if lowest < LOWEST_RADIUS:
         raise ArgumentError(
@@ -287,10 +292,10 @@ def propagate_orbit(
     times = np.atleast_1d(finite_array("seconds", seconds))
     if times.ndim != 1:
         raise ArgumentError("seconds", f"an array of shape {times.shape}: give times of shape (n,)")
-    if (longest := float(np.abs(times).max(initial=0.0))) > _LONGEST:
+    if (longest := float(np.abs(times).max(initial=0.0))) > LONGEST:
         raise ArgumentError(
             "seconds",
-            f"{longest:g} s from the state: the orbit is unknown after {_LONGEST:g} s (30 days): give a "
+            f"{longest:g} s from the state: the orbit is unknown after {LONGEST:g} s (30 days): give a "
             "newer state",
         )
     found = np.empty((len(times), 6))

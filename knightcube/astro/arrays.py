@@ -42,9 +42,13 @@ def finite_array(name: str, value: npt.ArrayLike, *shapes: tuple[int, ...]) -> F
 
 
 def check_finite(**given: FloatArray | float) -> None:
-    """Raise ArgumentError, with the name, for an argument that contains NaN or infinity."""
+    """Raise ArgumentError, with the name, for an argument that contains NaN, infinity or no numbers."""
     for name, value in given.items():
-        if not np.isfinite(value).all():
+        try:
+            finite = bool(np.isfinite(value).all())
+        except TypeError:
+            finite = False
+        if not finite:
             raise ArgumentError(name, f"{brief(np.asarray(value).tolist())}: give finite numbers")
 
 
@@ -164,6 +168,24 @@ def unit_vector(name: str, value: npt.ArrayLike) -> FloatArray:
     if not 0.0 < length < math.inf:
         raise ArgumentError(name, f"{vector.tolist()}: give a direction, whose length is not zero")
     return vector if abs(length - 1.0) <= _UNIT else np.asarray(vector / length)
+
+
+_ROUGHLY_UNIT = 1e-3
+"""Largest deviation of the length of a given quaternion from 1."""
+
+
+def unit_quaternion(name: str, value: npt.ArrayLike) -> FloatArray:
+    """Return the attitude `name` of a public function as a unit quaternion (4,).
+
+    The quaternion is normalised. Raises ArgumentError unless the quaternion is finite and its length differs
+    from 1 by at most 0.001.
+    """
+    quaternion = finite_array(name, value, (4,))
+    length = math.hypot(*quaternion.tolist())
+    if abs(length - 1.0) > _ROUGHLY_UNIT:
+        text = f"{quaternion.tolist()}: length {length:g}: give a quaternion of length 1, scalar part last"
+        raise ArgumentError(name, text)
+    return quaternion if abs(length - 1.0) <= _UNIT else np.asarray(quaternion / length)
 
 
 def select(record: Record, chosen: BoolArray | IntArray, *common: str) -> Record:

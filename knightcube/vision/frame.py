@@ -436,6 +436,8 @@ _FLOATING_NOISE = 16.0
 _LEAST_NOISE = 0.1
 # Count above which a float32, the data type of processed frames, cannot represent every integer.
 _INEXACT = 1 << 24
+# Largest pixel value of an image of floating-point numbers, whose square has single precision.
+_MOST_LIGHT = 1e18
 # Largest number of counts of an image of floating-point numbers.
 _MOST_COUNTS = float(1 << 31)
 
@@ -481,7 +483,10 @@ def grey_image(pixels: npt.ArrayLike) -> Image:
 
 
 def check_pixels(image: Image) -> None:
-    """Raise ArgumentError unless an image (rows, columns) has 16 x 16 or more finite real numbers."""
+    """Raise ArgumentError unless an image (rows, columns) has 16 x 16 or more finite real numbers.
+
+    Pixel values above `_MOST_LIGHT` are refused too.
+    """
     if image.ndim != 2 or min(image.shape) < LEAST_SIDE:
         raise ArgumentError(
             "image", f"an array of shape {image.shape}: give (rows, columns), {LEAST_SIDE} or more each"
@@ -493,6 +498,8 @@ def check_pixels(image: Image) -> None:
         raise ArgumentError(
             "image", f"{bad} pixels are not finite: replace them, such as by the median of the other pixels"
         )
+    if image.dtype.kind == "f" and max(-image.min(), image.max()) > _MOST_LIGHT:
+        raise ArgumentError("image", f"pixels from {image.min():g} to {image.max():g}: divide the image")
 
 
 def count_of_floats(image: Image) -> float:
@@ -500,6 +507,18 @@ def count_of_floats(image: Image) -> float:
     sample = image[::4, ::4].astype(float)
     spread = MAD_TO_SIGMA * float(np.median(np.abs(sample - np.median(sample))))
     return (spread or float(sample.std()) or 1.0) / _FLOATING_NOISE
+
+
+EXPOSURES = 1e-6, 1e5
+"""Shortest and longest accepted exposure time, s."""
+
+
+def checked_exposure(exposure: float) -> float:
+    """Return an exposure time (s). Raises ArgumentError unless it is a number within `EXPOSURES`."""
+    seconds = checked_number("exposure", exposure, "seconds")
+    if not EXPOSURES[0] <= seconds <= EXPOSURES[1]:
+        raise ArgumentError("exposure", f"{seconds:g}: give {EXPOSURES[0]:g} to {EXPOSURES[1]:g} seconds")
+    return seconds
 
 
 LONGEST_LINE_TIME = 0.01

@@ -27,9 +27,19 @@ from functools import lru_cache
 import numpy as np
 
 from knightcube.astro import chi_square
-from knightcube.astro.arrays import FloatArray, tangent_basis
+from knightcube.astro.arrays import (
+    FloatArray,
+    brief,
+    check_finite,
+    checked_deviation,
+    finite_array,
+    real_number,
+    tangent_basis,
+    unit_quaternion,
+    unit_vector,
+)
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector, multiply, normalise
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 
 _MOST_STEPS, _FULL_STEPS = 30, 8
 """Maximum number of Gauss-Newton steps, and number of initial steps that may increase chi-square."""
@@ -38,6 +48,9 @@ _SOFT = 0.05
 
 The smooth rise makes the derivative nonzero for faces that are parallel to the Sun direction.
 """
+_MOST_LIGHT = 100.0
+"""Upper limit of a current as a fraction of the peak current. No illumination explains larger currents, and
+the limit keeps their squares finite."""
 _RARE = 3.09
 """Deviation (standard deviations) that a normal variable exceeds with a probability of 1 in 1,000."""
 
@@ -70,7 +83,8 @@ class SolarStringModel:
         dark: fraction of the peak current below which a string counts as dark.
 
     Raises:
-        UsageError: if a value is out of range.
+        UsageError: if a value is out of range. The subclass ArgumentError is raised for arrays that do not
+            contain finite numbers.
     """
 
     normals: FloatArray = field(default_factory=lambda: np.concatenate([np.eye(3), -np.eye(3)]))
@@ -81,16 +95,17 @@ class SolarStringModel:
     dark: float = 0.1
 
     def __post_init__(self) -> None:
-        normals, peaks = np.asarray(self.normals, dtype=float), np.asarray(self.peaks, dtype=float)
+        normals, peaks = finite_array("normals", self.normals), finite_array("peaks", self.peaks)
         if normals.ndim != 2 or normals.shape[1] != 3 or len(normals) < 4:
             raise UsageError(f"solar strings: normals of shape {normals.shape}: give (n, 3), n of 4 or more")
         if not np.all(np.abs(np.linalg.norm(normals, axis=1) - 1.0) < 1e-6):
-            raise UsageError("solar strings: normals must be finite unit vectors")
-        if peaks.shape != (len(normals),) or not np.all((peaks > 0.0) & np.isfinite(peaks)):
+            raise UsageError("solar strings: normals must be unit vectors")
+        if peaks.shape != (len(normals),) or not np.all(peaks > 0.0):
             raise UsageError(f"solar strings: peaks {peaks}: give one positive current per string, in A")
         for name in ("sigma", "albedo", "albedo_sigma", "dark"):
-            if not 0.0 < getattr(self, name) < 1.0:
-                raise UsageError(f"solar strings: {name} {getattr(self, name)}: must lie between 0 and 1")
+            if not 0.0 < real_number(getattr(self, name)) < 1.0:
+                text = f"{brief(getattr(self, name))}: must lie between 0 and 1"
+                raise UsageError(f"solar strings: {name} {text}")
         object.__setattr__(self, "normals", normals)
         object.__setattr__(self, "peaks", peaks)
 
@@ -123,15 +138,11 @@ class CoarseSun:
 def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArray | None = None) -> CoarseSun:
     """Return the Sun direction in body axes from the currents (n,) of the solar strings, A.
 
-    The nadir direction (3,) is in body axes; an error of ten degrees has little effect. Raises ValueError if
-    the currents are not n finite numbers, or if the nadir direction is not finite.
+    The nadir direction (3,) is in body axes; an error of ten degrees has little effect. Raises ArgumentError
+    if the currents are not n finite numbers, or if the nadir direction is zero or not finite.
     """
-    currents = np.asarray(currents, dtype=float)
-    if currents.shape != strings.peaks.shape or not np.all(np.isfinite(currents)):
-        raise ValueError(f"currents {currents}: give {len(strings.peaks)} finite numbers, A")
-    if nadir is not None and not np.all(np.isfinite(nadir)):
-        raise ValueError(f"nadir {nadir}: give a finite unit vector")
-    shares = currents / strings.peaks
+    shares = _shares(currents, strings)
+    nadir = None if nadir is None else unit_vector("nadir", nadir)
     if shares.max() < strings.dark:
         return CoarseSun(CoarseSunStatus.DARK, reason=f"no string has {strings.dark:g} of its peak current")
     earth, information, averaging = _constants(strings)
@@ -154,6 +165,14 @@ def coarse_sun(currents: FloatArray, strings: SolarStringModel, nadir: FloatArra
         reason = f"no Sun direction explains the currents: chi-square {square:.0f} of {freedom}"
         return CoarseSun(CoarseSunStatus.UNCERTAIN, reason=reason)
     return CoarseSun(CoarseSunStatus.FOUND, direction, basis, inverse)
+
+
+def _shares(currents: FloatArray, strings: SolarStringModel) -> FloatArray:
+    """Return the currents (n,), A, as fractions of the peak currents, limited to `_MOST_LIGHT`.
+
+    Raises ArgumentError unless the currents are n finite numbers.
+    """
+    return np.minimum(finite_array("currents", currents, strings.peaks.shape) / strings.peaks, _MOST_LIGHT)
 
 
 def _fitted_direction(
@@ -255,6 +274,10 @@ class KnownDirections:
         light: illumination by an Earth that would fill half the sky, as a fraction of the illumination by the
             Sun.
         light_sigma: standard deviation of `light`.
+
+    Raises:
+        ArgumentError: for a field or a direction that is zero or not finite, and for another value that is
+            not finite or negative.
     """
 
     field: FloatArray
@@ -262,6 +285,14 @@ class KnownDirections:
     nadir: FloatArray
     light: float
     light_sigma: float
+
+    def __post_init__(self) -> None:
+        unit_vector("field", self.field)
+        object.__setattr__(self, "field", np.asarray(self.field, dtype=float))
+        for name in ("sun", "nadir"):
+            object.__setattr__(self, name, unit_vector(name, getattr(self, name)))
+        check_finite(light=self.light)
+        checked_deviation("light_sigma", self.light_sigma, "of the sunlight")
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -298,7 +329,13 @@ class FieldAndStrings:
         self._against[:] = 0.0
 
     def turn(self, rotation: FloatArray, seconds: float) -> None:
-        """Propagate the possible rotations over a `rotation` (4,) of the body within `seconds`, s."""
+        """Propagate the possible rotations over a `rotation` (4,) of the body within `seconds`, s.
+
+        Raises ArgumentError for an impossible rotation, and for a time that is negative or not finite.
+        """
+        rotation = unit_quaternion("rotation", rotation)
+        if not 0.0 <= real_number(seconds) < math.inf:
+            raise ArgumentError("seconds", f"{brief(seconds)}: give a finite time of 0 s or more")
         if self._base is not None:
             self._base = multiply(rotation, self._base)
         self._against = np.maximum(self._against - _MOST_VIOLATION * seconds / _MEMORY, 0.0)
@@ -310,11 +347,14 @@ class FieldAndStrings:
 
         The magnetic field (3,), body axes, T, has the standard deviation `sigma` per component, and the body
         rotates by `blur` rad during the reading. Returns None if no rotation is possible, or if the possible
-        rotations span more than half a circle.
+        rotations span more than half a circle. Raises ArgumentError for values that are not finite, and for a
+        field of zero.
         """
+        shares, axis = _shares(currents, self._strings), unit_vector("field", field)
+        for name, value, unit in (("sigma", sigma, "T"), ("blur", blur, "rad")):
+            check_finite(**{name: checked_deviation(name, value, unit)})
         strength = float(np.linalg.norm(sky.field))
-        axis, across = field / np.linalg.norm(field), sigma / strength
-        shares = currents / self._strings.peaks
+        across, blur = min(sigma / strength, math.pi), min(blur, math.pi)
         self.wrong = ""
         if shares.max() < self._strings.dark:
             self.wrong = f"no string has {self._strings.dark:g} of its peak current"

@@ -23,9 +23,9 @@ from knightcube.astro.arrays import (
     brief,
     check_type,
     checked_deviation,
-    checked_number,
     finite_array,
     real_number,
+    unit_quaternion,
 )
 from knightcube.astro.earth.sun import J2000, earth_velocity, ephemeris_date
 from knightcube.astro.quaternion import attitude_matrix, conjugate, multiply
@@ -37,7 +37,7 @@ from knightcube.vision.camera.lens import (
     check_camera,
     check_knowledge,
 )
-from knightcube.vision.frame import Bins, check_detector, grey_image
+from knightcube.vision.frame import Bins, check_detector, checked_exposure, grey_image
 from knightcube.vision.frame_job import BIN_SIZES, binned_settings, found_in_image, in_whole_image
 from knightcube.vision.lens_knowledge import LensKnowledge
 from knightcube.vision.startracker.index import SkyIndex, load_once
@@ -61,8 +61,6 @@ FOV_TOLERANCE = 0.05
 """Default uncertainty of a given field of view, as a fraction of the field of view."""
 _LEAST_FOV_ERROR = 0.001
 """Minimum uncertainty of a field of view without a calibrated lens, as a fraction of the field of view."""
-_UNIT_TOLERANCE = 1e-3
-"""Largest deviation of the length of a predicted quaternion from 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -291,7 +289,7 @@ class StarTracker:
                 pixels, masked or non-finite values, or if the value of another argument is not valid.
         """
         image = grey_image(image)
-        seconds = 1.0 if exposure is None else checked_number("exposure", exposure, "seconds")
+        seconds = 1.0 if exposure is None else checked_exposure(exposure)
         attitudes, rates = _priors(attitude, attitude_sigma, rate, rate_sigma)
         if rates is not None and exposure is None:
             raise ArgumentError("exposure", "None: a predicted rate needs the exposure time in seconds")
@@ -413,9 +411,7 @@ def _priors(
     attitude_sigma = checked_deviation("attitude_sigma", attitude_sigma, "rad")
     rate_sigma = checked_deviation("rate_sigma", rate_sigma, "rad/s")
     if attitude is not None:
-        quaternion = finite_array("attitude", attitude, (4,))
-        if abs(math.hypot(*quaternion) - 1.0) > _UNIT_TOLERANCE:
-            raise ArgumentError("attitude", f"{attitude!r}: give a quaternion of unit length, scalar last")
+        quaternion = unit_quaternion("attitude", attitude)
         # An uncertainty of half a turn or more leaves every attitude possible.
         attitudes = AttitudePrior(quaternion, attitude_sigma) if attitude_sigma < math.pi else None
     if rate is not None:

@@ -17,15 +17,32 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.arrays import (
+    FloatArray,
+    IntArray,
+    brief,
+    check_finite,
+    checked_number,
+    finite_array,
+    real_number,
+)
 from knightcube.astro.earth.geomagnetism import field, fields
-from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState, propagated
+from knightcube.astro.earth.orbit_knowledge import (
+    LONGEST,
+    LOWEST_RADIUS,
+    OrbitError,
+    OrbitState,
+    propagated,
+)
 from knightcube.astro.earth.orientation import ROTATION_RATE, celestial_to_terrestrial, terrestrial_time
 from knightcube.astro.earth.sun import DAY, earth_from_sun, sunlit_share
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
+from knightcube.errors import ArgumentError
 
 STEP = 10.0
 """Default time step of an ephemeris, s."""
+_MOST_STEPS = 1_000_000
+"""Largest number of steps of an ephemeris, whose computation takes minutes."""
 _Index = slice | IntArray
 
 
@@ -112,11 +129,22 @@ def predict(state: OrbitState, duration: float, step: float = STEP) -> Ephemeris
     """Return the ephemeris from an orbit state to `duration` s later in steps of `step` s, with the term J2.
 
     The neglected drag and higher gravity terms shift a satellite by one kilometre in two revolutions, which
-    changes the field by 15 nT. The field is extrapolated outside the years of its model.
+    changes the field by 15 nT. The field is extrapolated outside the years of its model. Raises ArgumentError
+    for a state within the Earth or with values that are not finite, for a duration or a step of more than 30
+    days, and for a step that is not positive or too short.
     """
+    position = finite_array("state.position", state.position, (3,))
+    velocity = finite_array("state.velocity", state.velocity, (3,))
+    check_finite(**{"state.julian_date": state.julian_date})
+    if float(np.linalg.norm(position)) < LOWEST_RADIUS:
+        raise ArgumentError("state.position", f"{position.tolist()}: within the Earth: give metres")
+    if not 0.0 <= real_number(duration) <= LONGEST:
+        raise ArgumentError("duration", f"{brief(duration)}: give 0 to {LONGEST:g} s, 30 days")
+    if not checked_number("step", step, "s") >= duration / _MOST_STEPS:
+        raise ArgumentError("step", f"{step:g}: give at least {duration / _MOST_STEPS:g} s")
     times: FloatArray = step * np.arange(np.ceil(duration / step) + 2.0)
     dates = state.julian_date + times / DAY
-    states = [np.concatenate([state.position, state.velocity])]
+    states = [np.concatenate([position, velocity])]
     for _ in times[1:]:
         states.append(propagated(states[-1], step))
     along = np.array(states)

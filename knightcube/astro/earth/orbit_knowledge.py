@@ -18,7 +18,7 @@ from functools import lru_cache
 import numpy as np
 from sgp4.api import SGP4_ERRORS, WGS72, Satrec
 
-from knightcube.astro.arrays import FloatArray, brief
+from knightcube.astro.arrays import FloatArray, brief, checked_deviation
 from knightcube.astro.earth.figure import EARTH_RADIUS, GRAVITATIONAL_PARAMETER, J2
 from knightcube.astro.earth.orientation import (
     ROTATION_RATE,
@@ -29,6 +29,14 @@ from knightcube.astro.earth.sun import DAY, J2000
 from knightcube.errors import ArgumentError, KnightCubeError, UsageError
 
 _LONGEST_STEP = 30.0
+LONGEST = 30.0 * DAY
+"""Longest time (s) over which an orbit is propagated from one state.
+
+The unknown drag displaces a satellite in a low orbit by hundreds to thousands of kilometres in 30 days.
+"""
+FASTEST, FARTHEST = 2e4, 1.5e9
+"""Largest speed (m/s) of a satellite, above the escape velocity, and largest distance (m) from the Earth's
+centre, the radius of the sphere in which the gravity of the Earth dominates (Hill sphere)."""
 _J2000 = datetime(2000, 1, 1, 12)
 _SGP4_EPOCH, _MINUTES_PER_DAY = 2_433_281.5, 1440.0
 """Julian date from which SGP4 counts days, and number of minutes in a day."""
@@ -37,6 +45,8 @@ _DRAG_FRACTION, _LEAST_DRAG = 0.5, 2.5e-4
 _DRAG_TIME, _DECAYING = 0.25, 1e7
 """Time (days) over which the along-track shift due to B* is computed, and shift (m/day^2) that is assumed if
 the orbit decays within this time."""
+_DATES = 2_400_000.5, 2_816_787.5
+"""First and last Julian date for which the orbit is asked: 17 November 1858 and 31 December 2999."""
 LARGEST_SIGMA = 1e6
 """Largest standard deviation (m) of a position per axis that the library returns from two-line elements."""
 
@@ -108,12 +118,22 @@ class GpsFix:
     longest_age: float = 1500.0
 
     def __post_init__(self) -> None:
-        """Raise OrbitError for values that are not finite and for a position inside the Earth."""
+        """Raise OrbitError for impossible values, such as a position inside the Earth."""
+        for name in ("position", "velocity"):
+            object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         numbers = np.array([self.julian_date, *self.position, *self.velocity])
         if numbers.shape != (7,) or not np.all(np.isfinite(numbers)):
             raise OrbitError(f"fix at {self.julian_date}: position and velocity must be (3,) and finite")
-        if np.linalg.norm(self.position) < LOWEST_RADIUS:
+        distance, speed = math.hypot(*self.position.tolist()), math.hypot(*self.velocity.tolist())
+        if distance < LOWEST_RADIUS:
             raise OrbitError(f"fix at {self.julian_date}: {self.position} m is within the Earth")
+        if distance > FARTHEST or speed > FASTEST:
+            raise OrbitError(
+                f"fix at {self.julian_date}: {distance:g} m from the Earth's centre at {speed:g} m/s: "
+                "give a position in m and a velocity in m/s"
+            )
+        for name, unit in (("sigma", "m"), ("velocity_sigma", "m/s"), ("longest_age", "s")):
+            checked_deviation(name, getattr(self, name), unit)
 
     def at(self, julian_date: float) -> OrbitState:
         """Return the orbit state propagated to a Julian date UTC. Raises OrbitError if the fix is too old."""
@@ -166,6 +186,8 @@ class TwoLineElements:
             sigma: standard deviation of the position per axis at the epoch of the elements, m.
             growth: growth of the standard deviation with the time from the epoch, m per day.
         """
+        for name, value, unit in (("sigma", sigma, "m"), ("growth", growth, "m per day")):
+            checked_deviation(name, value, unit)
         first, second = first.rstrip(), second.rstrip()
         check_lines(first, second)
         self._satellite = Satrec.twoline2rv(first, second)
@@ -210,6 +232,8 @@ class TwoLineElements:
         Raises OrbitError if SGP4 fails, or if the standard deviation of the position exceeds `LARGEST_SIGMA`
         because the date is too far from the epoch of the elements.
         """
+        if not _DATES[0] <= julian_date <= _DATES[1]:
+            raise ArgumentError("julian_date", f"{brief(julian_date)}: give a Julian date from 1858 to 2999")
         if not self._sigma_at(julian_date) <= LARGEST_SIGMA:
             begin, end = (_J2000 + timedelta(days=date - J2000) for date in (self.epoch, julian_date))
             raise OrbitError(
@@ -255,10 +279,13 @@ _State = tuple[float, float, float, float, float, float]
 
 
 def propagated(state: FloatArray, duration: float) -> FloatArray:
-    """Return the position (m) and velocity (m/s), together (6,), after a duration (s).
+    """Return the position (m) and velocity (m/s), together (6,), after a duration (s) of at most 30 days.
 
-    The equations of motion are integrated by the classical Runge-Kutta method.
+    The equations of motion are integrated by the classical Runge-Kutta method. Raises ArgumentError for
+    another duration.
     """
+    if not abs(duration) <= LONGEST:
+        raise ArgumentError("duration", f"{brief(duration)}: give at most {LONGEST:g} s, 30 days")
     steps = max(1, math.ceil(abs(duration) / _LONGEST_STEP))
     dt = duration / steps
     x, y, z, u, v, w = state.tolist()

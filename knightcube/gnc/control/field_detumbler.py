@@ -161,9 +161,12 @@ def braking_dipole(
     Each component is clipped separately at the limit of its body axis, because each coil removes momentum
     independently of the other coils. The matrix C (3, 3) from the commanded dipole moment m to the actual
     dipole moment is `coils`. The torque C m x B in the field B reduces the momentum along the costate y at
-    the rate m . C' (y x B).
+    the rate m . C' (y x B). Raises ArgumentError for values that are not finite.
     """
     wanted = coils.T @ cross_product(costate, field)
+    if not math.isfinite(float(wanted @ wanted)):
+        check_finite(costate=costate, field=field, coils=coils)
+    check_finite(limit=limit)
     return np.asarray(np.minimum(np.maximum(wanted, -limit), limit))
 
 

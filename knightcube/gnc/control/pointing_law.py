@@ -32,7 +32,7 @@ from knightcube.errors import ArgumentError
 from knightcube.gnc.control.coil_map import limited
 from knightcube.gnc.control.pointing_job import LONGEST_PREVIEW, PointingJob, new_table
 from knightcube.gnc.control.pointing_table import PointingTable, PointingWeights
-from knightcube.gnc.estimation.estimate import check_length
+from knightcube.gnc.estimation.estimate import of_unit_length
 from knightcube.gnc.guidance.attitude_law import AttitudeReference
 from knightcube.gnc.guidance.pointing_target import PointingTarget
 from knightcube.gnc.guidance.slew_model import heat_matrix
@@ -107,7 +107,7 @@ class PointingLaw:
         """
         if not math.isfinite(time):
             check_finite(time=time)
-        check_length("quaternion", quaternion)
+        quaternion = of_unit_length("quaternion", quaternion)
         wanted = self.reference(time)
         rotation = to_rotation_vector(multiply(quaternion, conjugate(wanted.quaternion)))
         # The rotation error rotates the reference rate into body axes, in which the rates are compared.
@@ -169,8 +169,8 @@ def plan_pointing(
         raise ArgumentError("dipole_limit", f"{limit.tolist()}: give limits above zero A m^2")
     check_target("target", target)
     check_type("weights", weights, PointingWeights)
-    q, w = finite_array("quaternion", quaternion, (4,)), finite_array("rate", rate, (3,))
-    check_length("quaternion", q)
+    q = of_unit_length("quaternion", finite_array("quaternion", quaternion, (4,)))
+    w = finite_array("rate", rate, (3,))
     axes, none = body_axes(pointing_axis, across_axis), np.zeros(SIZES)
     orbit = known_orbit(elements, time, LONGEST_PREVIEW).at(julian_date(time))
     areas = box_areas(tensor)

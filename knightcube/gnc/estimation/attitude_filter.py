@@ -33,7 +33,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray, IntArray, finite_array
+from knightcube.astro.arrays import FloatArray, IntArray, check_finite
 from knightcube.astro.quaternion import compose, exponential, twist
 from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.error_state import (
@@ -336,8 +336,8 @@ def first_checkpoint(
     measured attitude is reduced to the angle about the thread. Raises ArgumentError for an attitude that is
     not a unit quaternion, and for values that are not finite.
     """
-    for measured in (attitude.quaternion, attitude.covariance, rate.rate, rate.covariance):
-        finite_array("measurement", measured)
+    check_finite(quaternion=attitude.quaternion, rate=rate.rate)
+    check_finite(attitude_covariance=attitude.covariance, rate_covariance=rate.covariance)
     suspended, free = model.body.suspended, free_axes(model.body)
     a, b, c, d = attitude.quaternion.tolist()
     quaternion = exponential(0.0, twist((a, b, c, d)), 0.0) if suspended else (a, b, c, d)
@@ -439,8 +439,9 @@ class AttitudeFilter:
         If `gyro` is true, the gyro bias may also have changed at this time, and counts as unknown until
         attitude measurements determine it. The filter may have attributed the effect of wrong currents to a
         disturbance or a change of parameters. The measurements since `since_ns` are therefore applied again,
-        a few at each call of `catch_up`.
+        a few at each call of `catch_up`. Raises ArgumentError for a time that is not finite.
         """
+        check_finite(since_ns=since_ns)
         self.catch_up()
         index = max(self._history.index_before(since_ns), 1)
         if self._history:  # the replay must contain the time of the change
@@ -480,7 +481,8 @@ class AttitudeFilter:
         A measurement that follows the newest one by more than `LONGEST_GAP_NS` also fails the gate.
         """
         self.nis = math.nan
-        if self._history and measurement.time_ns - self._history.newest.time_ns > LONGEST_GAP_NS:
+        # The comparison with `not` is also true for a time of NaN.
+        if self._history and not measurement.time_ns - self._history.newest.time_ns <= LONGEST_GAP_NS:
             self._count(type(measurement), used=False)
             return False
         if self._branch is not None:
@@ -573,7 +575,7 @@ class AttitudeFilter:
         """
         if not self._history:
             raise ArgumentError("time_ns", f"{time_ns}: the filter has not started: call start first")
-        if time_ns - self._history.newest.time_ns > LONGEST_GAP_NS:
+        if not time_ns - self._history.newest.time_ns <= LONGEST_GAP_NS:
             raise ArgumentError(
                 "time_ns",
                 f"{time_ns}: more than an hour after the newest measurement at "

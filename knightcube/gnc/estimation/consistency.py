@@ -17,7 +17,7 @@ from scipy.special import gammaincinv
 from knightcube.astro.arrays import FloatArray, finite_array, real_number
 from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 from knightcube.errors import ArgumentError
-from knightcube.gnc.estimation.estimate import check_length
+from knightcube.gnc.estimation.estimate import of_unit_length
 
 
 def attitude_error(true: npt.ArrayLike, estimated: npt.ArrayLike) -> FloatArray:
@@ -33,9 +33,7 @@ def attitude_error(true: npt.ArrayLike, estimated: npt.ArrayLike) -> FloatArray:
         ArgumentError: if an argument is not a unit quaternion.
     """
     p, q = finite_array("true", true, (4,)), finite_array("estimated", estimated, (4,))
-    check_length("true", p)
-    check_length("estimated", q)
-    return to_rotation_vector(multiply(p, conjugate(q)))
+    return to_rotation_vector(multiply(of_unit_length("true", p), conjugate(of_unit_length("estimated", q))))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -42,27 +42,35 @@ _LENGTH = 0.1
 """Largest accepted difference between one and the length of a measured quaternion or direction."""
 
 
-def check_length(name: str, value: FloatArray) -> None:
-    """Raise ArgumentError for a vector whose length is not one. NaN is permitted, as in `_check_arrays`."""
+_ROUNDING = 1e-6
+"""Largest difference between one and the length of a measurement that is not normalised. A quaternion of
+numbers with single precision has errors of 1e-7."""
+
+
+def of_unit_length(name: str, value: FloatArray) -> FloatArray:
+    """Return a measured quaternion or direction with length one. NaN is permitted, as in `_check_arrays`.
+
+    Raises ArgumentError for a length that differs from one by more than a tenth.
+    """
     length = math.hypot(*value.tolist())
-    if abs(length - 1.0) > _LENGTH:
+    error = abs(length - 1.0)
+    if error > _LENGTH:
         kind = "quaternion" if len(value) == 4 else "vector"
         raise ArgumentError(name, f"{value.tolist()}: length {length:g}: give a {kind} of length 1")
+    return np.asarray(value / length) if error > _ROUNDING else value
 
 
-def check_measured(covariance: FloatArray, *units: str, finite: bool = False, **measured: FloatArray) -> None:
+def check_measured(covariance: FloatArray, *, finite: bool = False, **measured: FloatArray) -> None:
     """Raise ArgumentError unless the covariance is (3, 3), and the arrays `measured` are vectors (3,).
 
-    An array called `quaternion` must be (4,). The arrays named in `units` must be unit vectors or unit
-    quaternions. Values that are not finite are permitted unless `finite` is true.
+    An array called `quaternion` must be (4,). Values that are not finite are permitted unless `finite` is
+    true.
     """
     if finite:
         check_finite(covariance=covariance, **measured)
     _check_shape("covariance", covariance, (3, 3))
     for name, value in measured.items():
         _check_shape(name, value, (4,) if name == "quaternion" else (3,))
-    for name in units:
-        check_length(name, measured[name])
 
 
 def check_span(seconds: float, **given: FloatArray | float) -> None:
@@ -101,7 +109,7 @@ class AttitudeMeasurement(_AtOneTime):
     def __post_init__(self) -> None:
         """Raise ArgumentError for arrays of another shape, and for a quaternion whose length is not one."""
         _check_arrays(self, quaternion=(4,), covariance=(3, 3))
-        check_length("quaternion", self.quaternion)
+        object.__setattr__(self, "quaternion", of_unit_length("quaternion", self.quaternion))
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -165,8 +173,8 @@ class DirectionMeasurement(_AtOneTime):
     def __post_init__(self) -> None:
         """Raise ArgumentError for arrays of another shape, and for vectors whose length is not one."""
         _check_arrays(self, observed=(3,), reference=(3,), covariance=(3, 3))
-        check_length("observed", self.observed)
-        check_length("reference", self.reference)
+        for name in ("observed", "reference"):
+            object.__setattr__(self, name, of_unit_length(name, getattr(self, name)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

@@ -78,7 +78,7 @@ from knightcube.gnc.estimation.error_state import (
     widen,
     with_role,
 )
-from knightcube.gnc.estimation.estimate import Knowledge, check_measured, check_span
+from knightcube.gnc.estimation.estimate import Knowledge, check_measured, check_span, of_unit_length
 from knightcube.gnc.estimation.free_motion import Bodies, step
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
@@ -187,9 +187,8 @@ class FreeMotion:
 
     def stiffness(self, rate: FloatArray) -> FloatArray:
         """Return the derivative (3, 3) of the angular acceleration with respect to the rate (3,) rad/s."""
-        return np.asarray(
-            self.inverse @ (cross_matrix(self.inertia @ rate) - cross_matrix(rate) @ self.inertia)
-        )
+        slope = cross_matrix(self.inertia @ rate) - cross_matrix(rate) @ self.inertia
+        return np.asarray(self.inverse @ slope)
 
 
 _ROWS, _COLUMNS = (0, 1, 2, 1, 2, 0), (0, 1, 2, 2, 0, 1)
@@ -254,8 +253,7 @@ class FreeFilterSettings:
         """Return the error state of the filter for a body with the inertia tensor `inertia` (3, 3) kg m^2."""
         start, walk = self.torque
         torques = np.repeat([CONSTANT_SHARE * start, AIR_SHARE * start, LIGHT_SHARE * start], 3)
-        errors, ones = self.errors, np.ones(3)
-        coils = self.coils
+        errors, ones, coils = self.errors, np.ones(3), self.coils
         if coils is None:
             coils = _matrix_errors(errors.coil_gain, errors.coil_axes)
         blocks = [
@@ -415,7 +413,8 @@ class FreeFilter:
         (`doubted`), the covariance of the slow states is reset to the prior of the settings, and implausible
         values are set to zero.
         """
-        check_measured(covariance, "quaternion", finite=True, quaternion=quaternion, gyro=gyro)
+        check_measured(covariance, finite=True, quaternion=quaternion, gyro=gyro)
+        quaternion = of_unit_length("quaternion", quaternion)
         self.changes += 1
         if doubted:
             self.widen(np.arange(SLOW.start, SLOW.stop))
@@ -691,7 +690,7 @@ class FreeFilter:
         If `by_stars` is true, the attitude was measured by the star camera, otherwise by the horizon cameras.
         The covariance (3, 3), rad^2, is given in the present body axes.
         """
-        check_measured(covariance, "quaternion", quaternion=quaternion)
+        check_measured(covariance, quaternion=quaternion)
         since = from_rotation_vector(age * self.rate - 0.5 * age**2 * self.acceleration)
         rows = np.zeros((3, STATES))
         # The rotation since the measurement is estimated from the rate, and has an error due to the rate.
@@ -699,14 +698,15 @@ class FreeFilter:
         misaligned = CAMERA if by_stars else HORIZON
         rows[:, misaligned] = _EYE
         expected = multiply(from_rotation_vector(self._constants[misaligned]), self.quaternion)
-        error = multiply(multiply(since, quaternion), conjugate(expected))
+        error = multiply(multiply(since, of_unit_length("quaternion", quaternion)), conjugate(expected))
         return self._update(to_rotation_vector(error), rows, covariance)
 
     def direction(
         self, observed: FloatArray, reference: FloatArray, covariance: FloatArray, sun_cameras: int = 0
     ) -> bool:
         """Apply an observed direction; the arguments are attributes of `DirectionMeasurement`."""
-        check_measured(covariance, "observed", "reference", observed=observed, reference=reference)
+        check_measured(covariance, observed=observed, reference=reference)
+        observed, reference = of_unit_length("observed", observed), of_unit_length("reference", reference)
         if sun_cameras and sun_cameras != self.sun_cameras:
             self.renew(SUN_CAMERA, self.layout.prior[SUN_CAMERA, SUN_CAMERA])
             self.sun_cameras = sun_cameras

@@ -22,7 +22,14 @@ from dataclasses import dataclass
 import erfa
 import numpy as np
 
-from knightcube.astro.arrays import FloatArray
+from knightcube.astro.arrays import (
+    FloatArray,
+    check_finite,
+    check_numbers,
+    finite_array,
+    unit_quaternion,
+    unit_vector,
+)
 from knightcube.astro.earth.ephemeris import Ephemeris
 from knightcube.astro.earth.orientation import celestial_to_terrestrial
 from knightcube.astro.earth.sun import DAY
@@ -42,6 +49,8 @@ Direction = Callable[[Ephemeris, FloatArray], FloatArray]
 """Function that returns unit vectors (n, 3), ICRS, for an ephemeris and times (n,), s."""
 DIFFERENCE = 1.0
 """Time step (s) of the central differences from which rate and acceleration are computed."""
+_HIGHEST = 1e5
+"""Largest height (m) of a point on the ground above or below the ellipsoid."""
 MINIMUM_SINE = 1e-3
 """Smallest permitted sine of the angle between the two directions, because nearly parallel directions do not
 determine the roll."""
@@ -110,13 +119,18 @@ class AttitudeReferences:
 class AttitudeLaw:
     """An attitude law that aligns body `axis` (3,) with `first`, and body axis `across` (3,) with `second`.
 
-    The alignment with `first` is exact, and the alignment with `second` is as close as possible.
+    The alignment with `first` is exact, and the alignment with `second` is as close as possible. The axes are
+    normalised. Raises ArgumentError for an axis that is zero or not finite.
     """
 
     axis: FloatArray
     first: Direction
     across: FloatArray
     second: Direction
+
+    def __post_init__(self) -> None:
+        for name in ("axis", "across"):
+            object.__setattr__(self, name, unit_vector(name, getattr(self, name)))
 
     def attitudes(self, ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
         """Return commanded attitudes (n, 4) at times (n,) s. Raises UsageError for parallel directions."""
@@ -160,8 +174,11 @@ def sun(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
 
 
 def inertial(vector: FloatArray) -> Direction:
-    """Return the function of time that gives a direction (3,) fixed in inertial axes."""
-    fixed = _unit(np.asarray(vector, dtype=float))
+    """Return the function of time that gives a direction (3,) fixed in inertial axes.
+
+    Raises ArgumentError for a direction that is zero or not finite.
+    """
+    fixed = unit_vector("vector", vector)
 
     def at(_: Ephemeris, times: FloatArray) -> FloatArray:
         return np.broadcast_to(fixed, (len(times), 3))
@@ -173,9 +190,11 @@ def ground(latitude: float, longitude: float, height: float = 0.0) -> Direction:
     """Return the function of time that gives the direction from the satellite to a point on the ground.
 
     The geodetic coordinates are `latitude` and `longitude`, rad, and `height`, m above the WGS 84 ellipsoid.
-    Raises UsageError for values out of range.
+    Raises UsageError for values out of range, such as angles in degrees.
     """
-    if not (abs(latitude) <= 0.5 * np.pi and np.isfinite(longitude) and np.isfinite(height)):
+    check_numbers(latitude=latitude, longitude=longitude, height=height)
+    possible = abs(latitude) <= 0.5 * math.pi and abs(longitude) <= 2.0 * math.pi and abs(height) <= _HIGHEST
+    if not possible:
         raise UsageError(
             f"latitude {latitude}, longitude {longitude} rad, height {height} m is not a point on the Earth"
         )
@@ -199,9 +218,10 @@ def free_roll(
     """Return a law that aligns `axis` (3,) with `first` and keeps the roll of an attitude (4,) at `time`, s.
 
     The attitude is first rotated by the smallest rotation that aligns `axis`. The roll is then constant
-    relative to the direction `second`.
+    relative to the direction `second`. Raises ArgumentError for an impossible axis or quaternion.
     """
-    when, shown = np.array([time]), attitude_matrix(quaternion)
+    axis, shown = unit_vector("axis", axis), attitude_matrix(unit_quaternion("quaternion", quaternion))
+    when = np.array([time])
     kept = _turned(first(ephemeris, when)[0], shown.T @ axis, second(ephemeris, when)[0])
     return AttitudeLaw(axis, first, shown @ kept, second)
 
@@ -211,8 +231,10 @@ def passing(direction: FloatArray, velocity: FloatArray, since: float) -> Direct
 
     At the time `since`, s, the unit vector `direction` (3,) points to the object. The argument `velocity`
     (3,), 1/s, is the object's velocity relative to the satellite, divided by the distance, and zero for a
-    fixed direction.
+    fixed direction. Raises ArgumentError for values that are not finite, and for a direction of zero.
     """
+    direction, velocity = unit_vector("direction", direction), finite_array("velocity", velocity, (3,))
+    check_finite(since=since)
 
     def at(_: Ephemeris, times: FloatArray) -> FloatArray:
         return _unit(direction + (np.asarray(times) - since)[:, None] * velocity)
@@ -225,15 +247,18 @@ def following(
 ) -> AttitudeLaw:
     """Return the law that points `axis` (3,) to a `passing` object, without a rotation about `axis`.
 
-    The law starts with the given attitude (4,), rotated by the smallest rotation that aligns `axis`.
+    The law starts with the given attitude (4,), rotated by the smallest rotation that aligns `axis`. Raises
+    ArgumentError for an impossible axis or quaternion, and for values that `passing` refuses.
     """
-    shown = attitude_matrix(quaternion)
+    axis, shown = unit_vector("axis", axis), attitude_matrix(unit_quaternion("quaternion", quaternion))
+    towards = passing(direction, velocity, since)
+    direction = unit_vector("direction", direction)
     normal = np.cross(direction, velocity)
     size = float(np.linalg.norm(normal))
     now = shown.T @ axis
     normal = normal / size if size > 1e-9 else _turned(now, direction, shown.T @ _any_across(axis))
     across = shown @ _turned(direction, now, normal)
-    return AttitudeLaw(axis, passing(direction, velocity, since), across, inertial(normal))
+    return AttitudeLaw(axis, towards, across, inertial(normal))
 
 
 def approach(
@@ -243,9 +268,10 @@ def approach(
 
     The transition lasts from `begin` to `end` s. The rotation vector relative to the attitude law is a
     quintic polynomial of time, which starts with the body's rate relative to the law and ends with zero rate.
-    Raises UsageError unless `end` is after `begin`.
+    Raises UsageError unless `end` is after `begin`, and ArgumentError for an impossible attitude or rate.
     """
-    if not end > begin:
+    quaternion, rate = unit_quaternion("quaternion", quaternion), finite_array("rate", rate, (3,))
+    if not begin < end < math.inf:
         raise UsageError(f"an approach from {begin} to {end} s: the end must be after the start")
 
     def at(ephemeris: Ephemeris, times: FloatArray) -> FloatArray:
@@ -306,10 +332,17 @@ never parallel."""
 
 @dataclass(frozen=True, slots=True, eq=False)
 class BodyAxes:
-    """The pointing axis (3,) of a body, and the body axis `across` (3,) from which a roll is measured."""
+    """The pointing axis (3,) of a body, and the body axis `across` (3,) from which a roll is measured.
+
+    The axes are normalised. Raises ArgumentError for an axis that is zero or not finite.
+    """
 
     pointing: FloatArray
     across: FloatArray
+
+    def __post_init__(self) -> None:
+        for name in ("pointing", "across"):
+            object.__setattr__(self, name, unit_vector(name, getattr(self, name)))
 
 
 def law_of(

@@ -34,6 +34,7 @@ from knightcube.astro.arrays import (
     checked_number,
     finite_array,
     float_rows,
+    unit_quaternion,
 )
 from knightcube.astro.quaternion import attitude_matrix
 from knightcube.compiled import compiled_form_of, loop_helper
@@ -48,15 +49,21 @@ class LensError(KnightCubeError):
     """
 
 
-def _check_detector(columns: int, rows: int, focal_length: float) -> None:
+_MOST_PIXELS = 1 << 24  # largest number of rows or columns
+
+
+def _check_detector(camera: Pinhole | Lens) -> None:
     """Raise LensError unless the numbers of pixels are positive integers and the focal length is positive.
 
-    Raises ArgumentError for values that are not numbers.
+    Raises ArgumentError for values that are not numbers. Numbers such as 512.0 are converted to integers.
     """
+    columns, rows, focal_length = camera.columns, camera.rows, camera.focal_length
     if not (_is_count(columns) and _is_count(rows) and isinstance(focal_length, float)):
         check_numbers(columns=columns, rows=rows, focal_length=focal_length)
-    if not (columns > 0 and rows > 0 and columns % 1 == 0 and rows % 1 == 0):
-        raise LensError(f"{columns} x {rows} pixels: give positive whole numbers")
+    if not all(0 < count <= _MOST_PIXELS and count % 1 == 0 for count in (columns, rows)):
+        raise LensError(f"{columns} x {rows} pixels: give positive whole numbers, {_MOST_PIXELS} at most")
+    for name, count in (("columns", columns), ("rows", rows)):
+        object.__setattr__(camera, name, int(count))
     if not 0.0 < focal_length < math.inf:
         raise LensError(f"focal length {focal_length} px: must be positive and finite")
 
@@ -83,7 +90,7 @@ class Pinhole:
     focal_length: float
 
     def __post_init__(self) -> None:
-        _check_detector(self.columns, self.rows, self.focal_length)
+        _check_detector(self)
 
     @classmethod
     def from_field_of_view(cls, columns: int, rows: int, field_of_view: float) -> Pinhole:
@@ -237,7 +244,7 @@ class Lens:
     reach: float = field(init=False, repr=False, compare=False)
 
     def __post_init__(self) -> None:
-        _check_detector(self.columns, self.rows, self.focal_length)
+        _check_detector(self)
         if not (isinstance(self.centre, list | tuple | np.ndarray) and len(self.centre) == 2):
             raise ArgumentError("centre", f"{brief(self.centre)}: give the pixel (x, y) of the optical axis")
         x, y = self.centre
@@ -776,7 +783,7 @@ class MountedCamera:
 
     Attributes:
         lens: the camera model.
-        mounting: quaternion (4,) from body axes to camera axes.
+        mounting: unit quaternion (4,) from body axes to camera axes.
         to_camera: rotation matrix (3, 3) from body axes to camera axes.
     """
 
@@ -785,7 +792,7 @@ class MountedCamera:
     to_camera: FloatArray = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "mounting", np.asarray(self.mounting, dtype=float))
+        object.__setattr__(self, "mounting", unit_quaternion("mounting", self.mounting))
         object.__setattr__(self, "to_camera", attitude_matrix(self.mounting))
 
     def in_camera(self, directions: FloatArray) -> FloatArray:

@@ -21,6 +21,7 @@ from knightcube.astro.arrays import (
     checked_number,
     finite_array,
     real_number,
+    unit_quaternion,
     unit_vector,
 )
 from knightcube.astro.earth.figure import SEMI_MAJOR_AXIS
@@ -31,8 +32,6 @@ LEAST_ALTITUDE = 50e3
 
 _FEWEST_EDGES = 3
 """Number of edges that determine a cone, and with it the nadir and the altitude."""
-_UNIT_TOLERANCE = 1e-3
-"""Largest deviation of the length of an approximate quaternion from 1."""
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -71,10 +70,7 @@ class RoughAttitude:
     sigma: float
 
     def __post_init__(self) -> None:
-        quaternion = finite_array("quaternion", self.quaternion, (4,))
-        if abs(math.hypot(*quaternion.tolist()) - 1.0) > _UNIT_TOLERANCE:
-            raise ArgumentError("quaternion", f"{quaternion.tolist()}: give unit length, scalar part last")
-        object.__setattr__(self, "quaternion", quaternion)
+        object.__setattr__(self, "quaternion", unit_quaternion("quaternion", self.quaternion))
         _check_sigma(self.sigma)
 
 

@@ -40,7 +40,6 @@ from knightcube.astro.arrays import (
     FloatArray,
     Image,
     IntArray,
-    checked_number,
     finite_array,
 )
 from knightcube.astro.quaternion import attitude_matrix, from_rotation_vector
@@ -50,6 +49,7 @@ from knightcube.vision.background import MAD_TO_SIGMA
 from knightcube.vision.camera.lens import CameraModel, Pinhole, image_of_camera, streak_camera
 from knightcube.vision.frame import (
     check_detector,
+    checked_exposure,
     gain_in_counts,
     line_of,
     positions,
@@ -865,7 +865,7 @@ def detect_objects(
     """
     settings = ObjectSettings() if settings is None else settings
     check_detector(settings, ObjectSettings)
-    exposure = checked_number("exposure", exposure, "seconds")
+    exposure = checked_exposure(exposure)
     rotation = finite_array("rate", rate, (3,)) * exposure
     pixels, unit, zero = raw_counts(image_of_camera(image, camera))
     none = DetectedObjects((), np.empty((0, 3)), np.empty((0, 3, 3)))

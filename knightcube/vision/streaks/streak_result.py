@@ -22,13 +22,12 @@ from knightcube.astro.arrays import (
     Image,
     IntArray,
     checked_deviation,
-    checked_number,
     finite_array,
 )
 from knightcube.astro.quaternion import from_rotation_vector
 from knightcube.errors import ArgumentError
 from knightcube.vision.camera.lens import UNSTATED, CameraKnowledge, Pinhole, check_shape
-from knightcube.vision.frame import FrameState, check_pixels, frame_state, gain_in_counts
+from knightcube.vision.frame import FrameState, check_pixels, checked_exposure, frame_state, gain_in_counts
 from knightcube.vision.streaks.geometry import GAUSSIAN, Course, PsfProfile
 
 _UNCALIBRATED = CameraKnowledge()
@@ -319,7 +318,7 @@ def validate(
     if pixels.dtype.kind != "u":
         raise ArgumentError("frame", f"pixels of {pixels.dtype}: pass the raw counts as unsigned integers")
     check_pixels(pixels)
-    checked_number("exposure", exposure, "seconds")
+    checked_exposure(exposure)
     if prior_rate is not None:
         finite_array("prior_rate", prior_rate, (3,))
     checked_deviation("prior_sigma", prior_sigma, "rad/s")

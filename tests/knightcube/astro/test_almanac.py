@@ -174,6 +174,8 @@ NONE = [float("nan")] * 3
         (lambda: propagate_orbit(PLACE, NONE, [1.0]), "velocity: .* give finite"),
         (lambda: propagate_orbit(1e-3 * PLACE, 1e-3 * MOTION, [1.0]), "give metres"),
         (lambda: propagate_orbit(PLACE, 1e-3 * MOTION, [1.0]), "perigee 3 m from .* velocity in m/s"),
+        (lambda: propagate_orbit(PLACE, 1e200 * MOTION, [1.0]), "velocity: .* give at most 20000 m/s"),
+        (lambda: propagate_orbit(1e100 * PLACE, MOTION, [1.0]), "position: .* give at most 1.5e.09 m"),
         (lambda: propagate_orbit(PLACE, MOTION, [float("nan")]), "seconds: .* give finite"),
         (lambda: propagate_orbit("here", MOTION, [1.0]), "position: 'here': give finite numbers"),
         (lambda: propagate_elements(FIRST, [TIME]), "elements: '1 25544U.* give the two lines"),  # type: ignore[arg-type]

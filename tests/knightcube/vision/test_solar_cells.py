@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,7 +12,7 @@ from knightcube.astro import quaternion
 from knightcube.astro.arrays import FloatArray
 from knightcube.astro.earth.figure import EARTH_RADIUS
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, sunlit_share
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 from knightcube.vision import solar_cells
 from knightcube.vision.camera.lens import MountedCamera, Pinhole
 from knightcube.vision.solar_cells import (
@@ -160,12 +163,15 @@ def test_the_search_for_the_sun_never_alternates_between_two_directions() -> Non
 
 
 def test_wrong_currents_and_strings_are_refused() -> None:
-    with pytest.raises(ValueError, match="6 finite"):
+    with pytest.raises(ArgumentError, match=r"currents: .*shape \(6,\)"):
         coarse_sun(np.array([1.0, 2.0]), STRINGS)
-    with pytest.raises(ValueError, match="finite"):
+    with pytest.raises(ArgumentError, match=r"currents: .*finite"):
         coarse_sun(np.full(6, np.nan), STRINGS)
-    with pytest.raises(ValueError, match="nadir"):
-        coarse_sun(np.eye(6)[0], STRINGS, np.full(3, np.nan))
+    for nadir in (np.full(3, np.nan), np.zeros(3), np.ones(2)):
+        with pytest.raises(ArgumentError, match="nadir"):
+            coarse_sun(np.eye(6)[0], STRINGS, nadir)
+    with pytest.raises(UsageError, match="sigma None"):
+        SolarStringModel(sigma=None)  # type: ignore[arg-type]  # wrong on purpose
     with pytest.raises(UsageError, match="normals"):
         SolarStringModel(normals=np.eye(3))
     with pytest.raises(UsageError, match="peaks"):
@@ -370,3 +376,33 @@ def test_misfits_are_chi_squares_with_and_without_each_string() -> None:
             kept = np.delete(np.arange(6), omitted)
             part = left[kept] @ np.linalg.solve(covariance[np.ix_(kept, kept)], left[kept])
             assert without[omitted, trial] == pytest.approx(part)
+
+
+def test_a_nadir_of_another_length_and_currents_of_any_size_have_a_result() -> None:
+    currents, nadir = np.array([0.8, 0.6, 0.1, 0.0, 0.0, 0.0]), np.array([0.0, 0.0, -1.0])
+    usual, longer = (coarse_sun(currents, STRINGS, length * nadir) for length in (1.0, 7e6))
+    assert usual.direction is not None
+    assert longer.direction is not None
+    np.testing.assert_allclose(longer.direction, usual.direction, atol=1e-12)
+    assert coarse_sun(1e200 * currents, STRINGS, nadir).status is CoarseSunStatus.UNCERTAIN
+
+
+def test_a_reading_that_is_not_finite_is_refused_and_the_next_one_gives_an_attitude() -> None:
+    """A NaN in the excess chi-squares would make every later reading useless."""
+    truth, estimator = quaternion.IDENTITY, FieldAndStrings(_PLATES)
+    good: dict[str, Any] = {"currents": _currents(truth), "field": _SKY.field, "sigma": 1e-7, "blur": 0.0}
+    for name, value in good.items():
+        with pytest.raises(ArgumentError, match=name):
+            estimator.accept(**{**good, name: np.nan * value}, sky=_SKY)
+    for wrong, seconds in ((np.nan * truth, 1.0), (2.0 * truth, 1.0), (truth, np.nan), (truth, -1.0)):
+        with pytest.raises(ArgumentError, match=r"^(rotation|seconds): "):
+            estimator.turn(wrong, seconds)
+    assert estimator.accept(**good, sky=_SKY) is not None
+    changes: list[dict[str, Any]] = [
+        {"field": np.zeros(3)},
+        {"sun": np.nan * _SKY.sun},
+        {"light_sigma": -1.0},
+    ]
+    for change in changes:
+        with pytest.raises(ArgumentError, match=next(iter(change))):
+            replace(_SKY, **change)

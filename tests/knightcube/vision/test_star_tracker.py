@@ -278,7 +278,7 @@ def test_an_overexposed_image_and_an_empty_one_are_named(image: Image, reason: s
         ({"attitude": np.eye(4)[3], "attitude_sigma": math.nan}, "attitude_sigma: nan"),
         ({"attitude_sigma": -1.0}, "attitude_sigma: -1.0: give a standard deviation of"),
         ({"rate_sigma": math.nan}, "rate_sigma: nan: give a standard deviation of"),
-        ({"attitude": np.zeros(4)}, "give a quaternion of unit length, scalar last"),
+        ({"attitude": np.zeros(4)}, "give a quaternion of length 1, scalar part last"),
         ({"attitude": np.full(4, np.nan)}, "attitude: [nan, nan, nan, nan]: give finite numbers"),
         (
             {"attitude": [0.0, 0.0, 1.0]},

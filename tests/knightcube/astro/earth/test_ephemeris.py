@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from dataclasses import replace
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -9,6 +13,7 @@ from knightcube.astro.earth.ephemeris import Ephemeris, FieldAhead, dipole_field
 from knightcube.astro.earth.geomagnetism import field
 from knightcube.astro.earth.orbit_knowledge import OrbitError, OrbitState
 from knightcube.astro.earth.sun import ASTRONOMICAL_UNIT, DAY
+from knightcube.errors import ArgumentError
 
 STATE = OrbitState(2_461_120.0, np.array([6.878e6, 0.0, 0.0]), np.array([0.0, -988.0, 7548.0]), 10.0)
 
@@ -93,3 +98,24 @@ def test_the_field_ahead_gains_nodes_with_each_call_and_follows_the_satellite() 
     moved = OrbitState(later.julian_date, -later.position, -later.velocity, 10.0)
     jumped = ahead.along(moved, times)
     np.testing.assert_allclose(jumped[0], field(later.julian_date, moved.position), atol=1e-12)
+
+
+@pytest.mark.parametrize(
+    ("name", "change", "duration", "step"),
+    [
+        ("state.position", {"position": np.full(3, np.nan)}, 10.0, 10.0),
+        ("state.position", {"position": np.array([7000.0, 0.0, 0.0])}, 10.0, 10.0),
+        ("state.velocity", {"velocity": np.zeros(2)}, 10.0, 10.0),
+        ("state.julian_date", {"julian_date": math.nan}, 10.0, 10.0),
+        ("duration", {}, math.nan, 10.0),
+        ("duration", {}, 1e300, 10.0),
+        ("step", {}, 10.0, 0.0),
+        ("step", {}, 10.0, 1e-300),
+        ("duration", {}, 10.0, 1e300),
+    ],
+)
+def test_a_prediction_without_a_result_is_refused_instead_of_computed_without_end(
+    name: str, change: dict[str, Any], duration: float, step: float
+) -> None:
+    with pytest.raises(ArgumentError, match=f"^{name}: "):
+        predict(replace(STATE, **change), duration, step)

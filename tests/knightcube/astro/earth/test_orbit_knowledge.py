@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import math
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -15,7 +18,7 @@ from knightcube.astro.earth.orientation import (
     mean_equator_to_celestial,
     north_east_down,
 )
-from knightcube.errors import UsageError
+from knightcube.errors import ArgumentError, UsageError
 from sim_hal.worlds.orbit import KeplerianElements, propagate
 from tests.support.orbit_elements import summed
 
@@ -139,3 +142,29 @@ def test_a_decayed_orbit_is_reported() -> None:
     second = "2 28872  96.4736 157.9986 0303955 244.0492 110.6523 16.46015938 10708"
     with pytest.raises(OrbitError, match="SGP4"):
         TwoLineElements(first, second).at(2_453_703.5 + 0.02012661 + 2.0)
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"position": np.array([7e206, 0.0, 0.0])},
+        {"velocity": np.array([0.0, 7e203, 0.0])},
+        {"sigma": math.nan},
+        {"velocity_sigma": -1.0},
+        {"longest_age": math.nan},
+    ],
+    ids=["position", "velocity", "sigma", "velocity sigma", "age"],
+)
+def test_a_fix_from_which_no_state_follows_is_refused(change: dict[str, Any]) -> None:
+    good: dict[str, Any] = {"position": [7e6, 0.0, 0.0], "velocity": [0.0, 7.5e3, 0.0]}
+    assert np.isfinite(GpsFix(2_461_000.5, **good).at(2_461_000.501).position).all()
+    with pytest.raises((ArgumentError, OrbitError)):
+        GpsFix(2_461_000.5, **{**good, **change})
+
+
+@pytest.mark.parametrize("date", [math.nan, math.inf, 0.0, 1e300])
+def test_elements_refuse_a_date_before_1858_or_after_2999(date: float) -> None:
+    with pytest.raises(ArgumentError, match="julian_date"):
+        TwoLineElements(FIRST, SECOND).known_at(date)
+    with pytest.raises(ArgumentError, match="growth"):
+        TwoLineElements(FIRST, SECOND, growth=math.nan)

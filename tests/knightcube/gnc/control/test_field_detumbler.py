@@ -593,3 +593,11 @@ def test_after_a_time_stamp_far_ahead_the_rate_is_estimated_again_before_the_coi
     for now_ns in range(ahead_ns, ahead_ns + LONG.period_ns, 100_000_000):
         assert not law.dipole(now_ns).any()
     assert law.restarts == 1
+
+
+@pytest.mark.parametrize("name", ["costate", "field", "limit"])
+def test_a_braking_dipole_follows_only_from_finite_values(name: str) -> None:
+    good: dict[str, Any] = {"costate": np.ones(3), "field": np.array([1e-5, 2e-5, 3e-5]), "limit": 0.1}
+    assert braking_dipole(**good).any()
+    with pytest.raises(ArgumentError, match=name):
+        braking_dipole(**{**good, name: np.nan * good[name]})

@@ -464,3 +464,39 @@ def test_a_direction_of_length_zero_is_refused() -> None:
     for observed, reference in ((np.zeros(3), down), (down, np.zeros(3))):
         with pytest.raises(ArgumentError, match="vector of length 1"):
             DirectionMeasurement(0, observed, reference, np.eye(3))
+
+
+def test_measured_quaternions_and_directions_are_normalised_unless_only_rounded() -> None:
+    covariance, rounded = np.eye(3), np.array([0.5, 0.5, 0.5, 0.5 + 1e-7])
+    attitude = AttitudeMeasurement(0, 1.05 * rounded, covariance)
+    assert math.hypot(*attitude.quaternion) == pytest.approx(1.0, abs=1e-12)
+    assert AttitudeMeasurement(0, rounded, covariance).quaternion is rounded
+    down = np.array([0.0, 0.0, 1.0])
+    direction = DirectionMeasurement(0, 0.95 * down, 1.05 * down, covariance)
+    np.testing.assert_array_equal([direction.observed, direction.reference], [down, down])
+
+
+def test_times_that_are_not_numbers_are_refused_instead_of_searched_for_without_end() -> None:
+    filter_ = begin(fly(1, 2, False), False)
+    with pytest.raises(ArgumentError, match="since_ns"):
+        filter_.mark_unknown(math.nan)  # type: ignore[arg-type]  # wrong on purpose
+    with pytest.raises(ArgumentError, match="time_ns"):
+        filter_.at(math.nan)  # type: ignore[arg-type]  # wrong on purpose
+    late = RateMeasurement(math.nan, np.zeros(3), RATE_COVARIANCE)  # type: ignore[arg-type]  # the same
+    assert not filter_.measure(late)
+
+
+@BOTH
+def test_the_start_names_the_value_that_is_not_finite(suspended: bool) -> None:
+    body = SUSPENDED if suspended else FREE
+    attitude = AttitudeMeasurement(0, np.array([0.0, 0.0, 0.0, 1.0]), TURN_COVARIANCE)
+    rate = RateMeasurement(0, np.zeros(3), RATE_COVARIANCE)
+    nothing = np.full((3, 3), np.nan)
+    for name, wrong in (
+        ("quaternion", (replace(attitude, quaternion=np.full(4, np.nan)), rate)),
+        ("attitude_covariance", (replace(attitude, covariance=nothing), rate)),
+        ("rate", (attitude, replace(rate, rate=np.full(3, np.nan)))),
+        ("rate_covariance", (attitude, replace(rate, covariance=nothing))),
+    ):
+        with pytest.raises(ArgumentError, match=f"^{name}: "):
+            AttitudeFilter(body, SETTINGS).start(*wrong)

@@ -348,3 +348,16 @@ def test_measurements_of_another_shape_or_length_are_refused_and_change_nothing(
     with pytest.raises(ArgumentError, match="dipole"):
         found.advance(1.0, np.nan * down, around(0.0))
     np.testing.assert_array_equal(found.covariance, before)
+
+
+def test_quaternions_and_directions_of_nearly_unit_length_are_normalised() -> None:
+    down, along, still = np.array([0.0, 0.0, 1.0]), np.array([0.0, 0.1, 0.995]), np.zeros(3)
+    found = []
+    for length in (1.0, 1.05):
+        one = FreeFilter(INERTIA, FreeFilterSettings())
+        one.start(length * IDENTITY, 1e-2 * np.eye(3), still)
+        assert math.hypot(*one.quaternion) == pytest.approx(1.0, abs=1e-12)
+        assert one.direction(length * down, length * along / math.hypot(*along), 1e-2 * np.eye(3))
+        assert one.attitude(length * IDENTITY, 1e-2 * np.eye(3))
+        found.append(one)
+    np.testing.assert_allclose(found[1].quaternion, found[0].quaternion, atol=1e-12)

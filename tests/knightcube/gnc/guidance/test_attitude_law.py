@@ -2,6 +2,10 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 
@@ -23,12 +27,14 @@ from knightcube.gnc.guidance.attitude_law import (
     BodyAxes,
     Direction,
     approach,
+    following,
     free_roll,
     ground,
     inertial,
     law_of,
     nadir,
     orbit_normal,
+    passing,
     references,
     sun,
     velocity,
@@ -143,3 +149,41 @@ def test_a_prediction_follows_its_orbit_between_the_instants() -> None:
     np.testing.assert_allclose(coarse.velocity_at(times), fine.velocity_at(times), atol=0.01)
     np.testing.assert_allclose(coarse.field_at(times), fine.field_at(times), atol=1e-8)
     np.testing.assert_allclose(np.linalg.norm(coarse.sun_at(times), axis=1), 1.0)
+
+
+NAN = math.nan * X
+QUATERNION = np.array([0.5, 0.5, 0.5, 0.5])
+
+
+@pytest.mark.parametrize(
+    ("name", "call"),
+    [
+        ("pointing", lambda: BodyAxes(NAN, X)),
+        ("across", lambda: BodyAxes(X, 0.0 * X)),
+        ("axis", lambda: AttitudeLaw(0.0 * X, nadir, Z, velocity)),
+        ("across", lambda: AttitudeLaw(X, nadir, NAN, velocity)),
+        ("vector", lambda: inertial(0.0 * X)),
+        ("latitude", lambda: ground(None, 0.3)),  # type: ignore[arg-type]  # wrong on purpose
+        ("latitude 0.5, longitude 100", lambda: ground(0.5, 100.0)),
+        ("direction", lambda: passing(0.0 * X, X, 0.0)),
+        ("velocity", lambda: passing(X, NAN, 0.0)),
+        ("since", lambda: passing(X, X, math.nan)),
+        ("axis", lambda: following(NAN, X, Z, 0.0, QUATERNION)),
+        ("quaternion", lambda: following(Z, X, Z, 0.0, 2.0 * QUATERNION)),
+        ("quaternion", lambda: free_roll(Z, nadir, velocity, math.nan * QUATERNION, ORBIT, 1.0)),
+        ("quaternion", lambda: approach(NADIR.attitudes, 2.0 * QUATERNION, X, 0.0, 1.0)),
+        ("rate", lambda: approach(NADIR.attitudes, QUATERNION, NAN, 0.0, 1.0)),
+        ("approach", lambda: approach(NADIR.attitudes, QUATERNION, X, 0.0, math.inf)),
+    ],
+)
+def test_values_without_an_attitude_are_refused_by_name(name: str, call: Callable[[], Any]) -> None:
+    with pytest.raises(UsageError, match=f"^(an )?{name}"):
+        call()
+
+
+def test_axes_of_another_length_give_the_same_law() -> None:
+    """An attitude matrix of axes with another length would not be a rotation."""
+    times = np.array([10.0, 20.0])
+    usual, longer = (AttitudeLaw(length * Z, nadir, length * X, velocity) for length in (1.0, 2.0))
+    np.testing.assert_array_equal(longer.attitudes(ORBIT, times), usual.attitudes(ORBIT, times))
+    np.testing.assert_array_equal(BodyAxes(3.0 * Z, 0.5 * X).pointing, Z)

@@ -2,18 +2,22 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import assume, given
 from hypothesis import strategies as st
 
 from knightcube.astro.arrays import FloatArray
+from knightcube.errors import ArgumentError
 from knightcube.vision.camera.lens import (
     CameraModel,
     DistortedPinhole,
     Exposures,
     Lens,
     LensError,
+    MountedCamera,
     Pinhole,
     _distorted,
     _ideal_points,
@@ -325,3 +329,19 @@ def test_the_compiled_distortion_equals_that_in_numpy() -> None:
 def test_the_compiled_inversion_of_the_distortion_equals_that_in_numpy(k1: float, k2: float) -> None:
     tangents = np.append(np.linspace(0.0, 0.9, 40), np.nan)
     assert_forms_agree(_undistorted, tangents, k1, k2, 0.7)
+
+
+def test_whole_numbers_of_pixels_become_integers_and_huge_numbers_are_refused() -> None:
+    count: Any = 512.0
+    for camera in (Pinhole(count, count, 800.0), Lens(count, count, 800.0, (255.5, 255.5))):
+        assert (type(camera.columns), type(camera.rows)) == (int, int)
+    with pytest.raises(LensError, match="at most"):
+        Pinhole(1e300 * count, 400, 800.0)
+
+
+def test_a_mounting_of_rounded_numbers_is_normalised_and_one_of_another_length_is_refused() -> None:
+    lens = Pinhole(512, 400, 800.0)
+    mounted = MountedCamera(lens, np.array([0.7071, 0.0, 0.0, 0.7071]))
+    np.testing.assert_allclose(mounted.to_camera @ mounted.to_camera.T, np.eye(3), atol=1e-12)
+    with pytest.raises(ArgumentError, match=r"mounting: .*length 2"):
+        MountedCamera(lens, np.array([0.0, 0.0, 0.0, 2.0]))
