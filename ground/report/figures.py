@@ -685,7 +685,8 @@ def day_figure(
     for one in prediction.passes(stations):
         colour = colours[one.station.name]
         level = rows - 1 - stations.index(one.station)
-        bars.barh(level, one.set - one.rise, left=one.rise, height=0.6, color=colour)
+        # The edge keeps a pass of half a minute, which is narrower than a pixel, visible.
+        bars.barh(level, one.set - one.rise, left=one.rise, height=0.6, color=colour, ec=colour, lw=1.5)
         text = f"{one.elevation_deg:.0f}°"
         bars.annotate(text, (one.top, level + 0.32), ha="center", va="bottom", fontsize=7, color=panels.BLACK)
     names = [station.name for station in stations]

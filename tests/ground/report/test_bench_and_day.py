@@ -13,6 +13,7 @@ import pytest
 
 pytest.importorskip("matplotlib", reason="pictures need the extra 'plots'")
 from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.dates import date2num
 from matplotlib.figure import Figure
 
@@ -214,6 +215,25 @@ def test_a_day_shows_elevations_passes_and_eclipses() -> None:
     assert colours == list(panels.PATH_COLOURS[:2])
     first, second, third = (patch.get_facecolor() for patch in below.patches[:3])
     assert first == third != second
+
+
+def test_a_pass_of_half_a_minute_is_visible() -> None:
+    """The bar of a pass over a day is narrower than a pixel, but at least two columns have its colour."""
+
+    class Short(Prediction):
+        def passes(self, stations: Sequence[Any]) -> list[Any]:
+            ends = {"rise": at(9.0), "top": at(9.002), "set": at(9.0 + 34.0 / 3600.0)}
+            return [SimpleNamespace(station=stations[0], **ends, elevation_deg=5.0)]
+
+    figure = day_figure(Short(STATIONS), STATIONS, [])  # type: ignore[arg-type]
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    below = figure.axes[1]
+    instant = float(date2num(at(9.0)))  # type: ignore[no-untyped-call]
+    column, row = np.round(below.transData.transform((instant, 1.0))).astype(int)
+    pixels = np.asarray(canvas.buffer_rgba())[::-1][row, column - 3 : column + 4, :3]
+    colour = np.round(255.0 * np.array(below.patches[0].get_facecolor()[:3]))
+    assert int((np.abs(pixels - colour).max(axis=1) < 40.0).sum()) >= 2
 
 
 def test_targets_are_in_a_row_of_their_own_and_last_to_the_next() -> None:
