@@ -117,7 +117,7 @@ def test_a_wrong_gain_of_the_monitor_in_short_pulses_does_not_isolate_a_coil(gai
         watch.commanded(now_ns, wanted)
         drawn.append(float(np.abs(wanted).sum()))
     assert watch.verdicts == ()
-    assert f"the monitor measures {gain:.2f} of the current" in watch.monitor_doubted
+    assert f"the monitor measures {gain:.2f} times the current" in watch.monitor_doubted
 
 
 def test_a_suspicion_of_coils_at_zero_ends_if_no_probe_is_applied() -> None:
