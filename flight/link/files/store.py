@@ -401,16 +401,17 @@ class Store:
         Raises FileError if the file cannot be moved; a further call repeats the failed operation.
         """
         assert record.name is not None
-        target = self.received / record.name
+        target, problem = self.received / record.name, "cannot be placed"
         try:
             make_folder(target.parent)
             try:
                 os.replace(self.part(record), target)
             except FileNotFoundError:
                 target.stat()
+            problem = "is stored, but a power loss may remove it"
             make_lasting(target.parent)
         except OSError as error:
-            raise FileError(f"{record.name}: cannot be placed: {error.strerror or error}") from error
+            raise FileError(f"{record.name}: {problem}: {error.strerror or error}") from error
 
     def room(self, copy: bool = False) -> int:
         """Return the disk space (bytes) available for a received file, or for its selected copy if `copy`."""

@@ -836,9 +836,12 @@ def test_a_new_name_is_synced_to_disk_in_each_folder(tmp_path: Path, monkeypatch
     assert synced == [folder.received, folder.received / "elements"]
 
 
-@pytest.mark.parametrize("failing", ["received", "received/elements"])
+@pytest.mark.parametrize(
+    ("failing", "problem"),
+    [("received", "cannot be placed"), ("received/elements", "is stored, but a power loss may remove it")],
+)
 def test_a_file_is_placed_only_if_each_new_name_was_synced_to_disk(
-    tmp_path: Path, failing: str, monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path, failing: str, problem: str, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     folder, record = Store(tmp_path), Incoming(GROUND, 7, "elements/a", 4)
     folder.part(record).write_bytes(b"data")
@@ -850,7 +853,7 @@ def test_a_file_is_placed_only_if_each_new_name_was_synced_to_disk(
             raise OSError(errno.EIO, os.strerror(errno.EIO))
 
     monkeypatch.setattr(store, "make_lasting", sync)
-    with pytest.raises(FileError, match="Input/output error"):
+    with pytest.raises(FileError, match=f"elements/a: {problem}: Input/output error"):
         folder.place(record)
     folder.place(record)
     assert synced.count(tmp_path / failing) == 2
