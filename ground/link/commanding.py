@@ -359,8 +359,8 @@ class FileSession:
     def ask(self, directive: Directive, now_ns: int) -> None:
         """Send a command and repeat it until the satellite answers.
 
-        Late reports on earlier commands are ignored, and failures of transfers that they began: the satellite
-        cancels an interrupted transfer if the file has changed since then.
+        Late reports on earlier commands are ignored, and the end of transfers that these began and that the
+        satellite cancels, because the file has changed since then.
         """
         self._earlier = {(one.source, one.number) for one in self.entity.transfers() if not one.outgoing}
         self._counters.clear()
@@ -440,13 +440,15 @@ class FileSession:
         """Return whether a transfer of a file has ended, and forget all ended transfers.
 
         If `number` is given, only the transfer with this number is considered. Raises KnightCubeError with
-        the reason if the transfer has failed. The satellite reports a failure of an earlier transfer that it
-        continues.
+        the reason if the transfer has failed.
         """
         found = [one for one in self.entity.ended if one.name == name and number in {None, one.number}]
         self.entity.ended.clear()
         for one in found:
-            if one.condition != 0 and (one.source, one.number) not in self._earlier:
+            is_earlier = (
+                one.condition == units.Condition.CANCELLED and (one.source, one.number) in self._earlier
+            )
+            if one.condition != 0 and not is_earlier:
                 self._failed.append((one, self._credit_ns + _REASON_NS))
         for one, until in self._failed:
             # The satellite's reason is in the packet `transfer`, which may follow the end of the transfer.
