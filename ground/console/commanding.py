@@ -37,7 +37,7 @@ from flight.schema.sections import Commands
 from ground.console.history import values
 from ground.documentation import Body, commands_for, foreign_modes, layouts_for
 from ground.link.commanding import FileSession, exchange, explained, no_answer, obeyed, sha256_of
-from ground.link.terminal import Terminal, report_of
+from ground.link.terminal import KEEP_ALIVE_S, Terminal, report_of
 from ground.telemetry import decode, scan
 from hal.interfaces.wires import SECOND_NS
 from knightcube.errors import KnightCubeError, UsageError
@@ -55,7 +55,7 @@ _RUN, *_OF_THE_LINK = (
 )
 """First bytes of each packet of type `run`, and of each packet that the link process makes."""
 _PING_AFTER_S = 2.0
-"""Time (s) without telemetry after which a ping is sent, because the link forgets silent UDP senders."""
+"""Time (s) without telemetry after which a ping is sent, because a link that restarts forgets the ground."""
 _ANSWER_S = 5.0  # longest time (s) to wait for the report on a command over the link
 _KEPT_REPORTS = 64
 _SPI = 1
@@ -247,7 +247,8 @@ class LinkFeed:
         """
         with self.lock:
             now = time.monotonic()
-            if now - max(self._received, self._asked) > _PING_AFTER_S or self._asked < 0.0:
+            is_silent = now - max(self._received, self._asked) > _PING_AFTER_S
+            if is_silent or now - self._asked > KEEP_ALIVE_S:
                 self._asked = now
                 with contextlib.suppress(KnightCubeError):
                     self._terminal.send(self._packer.pack(commands.Ping(), utc_ns()), _SPI)

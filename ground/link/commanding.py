@@ -47,6 +47,7 @@ from ground.link.terminal import (
     ADDRESSES,
     DEFAULTS,
     FRAME_OVERHEAD_BYTES,
+    KEEP_ALIVE_S,
     Terminal,
     TerminalSettings,
     open_terminal,
@@ -230,9 +231,10 @@ def command(
     """Send a command, `show` its reports and return them. Raises KnightCubeError if no report arrives.
 
     The call ends with the final report, as soon as `ended` returns true for the received reports, or after
-    `seconds` s. A ping is sent after each silence, because a link process that restarts, or that receives no
-    frame for a minute, forgets the UDP address of the ground. Afterwards, the counters of the ground are
-    raised above those of the satellite if the frame's counter was used before, or if the reserve SPI is used.
+    `seconds` s. A ping is sent after each silence and every `KEEP_ALIVE_S`, because a link process that
+    restarts, or that receives no frame for a minute, forgets the UDP address of the ground. Afterwards, the
+    counters of the ground are raised above those of the satellite if the frame's counter was used before, or
+    if the reserve SPI is used.
     """
     found = _followed(terminal, packet, spi, seconds, show, ended)
     if spi == COMMAND_SPIS[1] or any(report.stage is Stage.REPEATED for report in found):
@@ -253,16 +255,17 @@ def _followed(
 ) -> list[Report]:
     """Send a command, `show` its reports and return them, see `command`."""
     counter, packer, found = terminal.send(packet, spi), CommandPacker(), list[Report]()
-    left = seconds
+    left, idle = seconds, 0.0  # `idle` is the time (s) since the last frame to the satellite
     while left > 0.0:
         wait, heard = min(left, _SILENCE_S), terminal.gate.admitted
-        left -= wait
+        left, idle = left - wait, idle + wait
         for report in terminal.follow(counter, spi, wait, reported=bool(found)):
             show(report)
             found.append(report)
             if ended(found) or report.stage.final or report.stage is Stage.REPEATED:
                 return found
-        if terminal.gate.admitted == heard and left > 0.0:
+        if left > 0.0 and (terminal.gate.admitted == heard or idle >= KEEP_ALIVE_S):
+            idle = 0.0
             with suppress(KnightCubeError):  # the reports may arrive even if the ping fails
                 terminal.send(packer.pack(Ping(), utc_ns()), spi)
     if not found:
@@ -354,6 +357,7 @@ class FileSession:
         self._counters: set[int] = set()
         self._reports: deque[Report] = deque()
         self._unsent = b""  # packet that could not be sent yet
+        self._packer, self._sent_ns = CommandPacker(), now_ns  # for pings; time of the last sent packet
         self._credit, self._credit_ns = 0.0, now_ns  # transmission capacity at the last call of `transmit`
 
     def ask(self, directive: Directive, now_ns: int) -> None:
@@ -371,7 +375,12 @@ class FileSession:
         self._asked = (directive, now_ns + _REPEAT_NS)
         if isinstance(directive, SendFile):
             self._wanted.add(directive.name)
-        self._counters.add(self._terminal.send_by(self._sealer, directives.pack(directive, utc_ns())))
+        self._counters.add(self._send_packet(directives.pack(directive, utc_ns()), now_ns))
+
+    def _send_packet(self, packet: bytes, now_ns: int) -> int:
+        counter = self._terminal.send_by(self._sealer, packet)
+        self._sent_ns = now_ns
+        return counter
 
     def put(self, path: Path, name: str, now_ns: int) -> Progress:
         """Start or continue the transfer of a file to the satellite. Raises KnightCubeError."""
@@ -401,7 +410,7 @@ class FileSession:
                     self._texts[int(row["source"]), int(row["number"])] = text_of(row["text"])
 
     def transmit(self, now_ns: int) -> None:
-        """Send the commands and PDUs that are due, within the rate limit.
+        """Send due commands and PDUs within the rate limit, or a ping if none were due for `KEEP_ALIVE_S`.
 
         Raises KnightCubeError if a packet cannot be sent. The next call then sends the packet again.
         """
@@ -417,9 +426,11 @@ class FileSession:
                 self._unsent = self._units.pack(unit, utc_ns())
             if not self._unsent:
                 break
-            self._terminal.send_by(self._sealer, self._unsent)
+            self._send_packet(self._unsent, now_ns)
             self._credit -= len(self._unsent) + FRAME_OVERHEAD_BYTES
             self._unsent = b""
+        if now_ns - self._sent_ns >= KEEP_ALIVE_S * 1e9:
+            self._send_packet(self._packer.pack(Ping(), utc_ns()), now_ns)
 
     def _may_come(self, metadata: units.Metadata) -> str:
         """Return why a file from the satellite is rejected, or an empty text if it is accepted."""

@@ -45,6 +45,8 @@ _CONNECT_S = 1.5  # longest time (s) to wait for a TCP connection; the wait bloc
 _LOST = -2  # value of `highest` in the packet `link` for an SPI whose counter is lost
 PORTS = 1 << 16  # number of TCP and UDP ports
 _TURN_S = 1.0  # longest time (s) to wait while another program sends a frame with the same keys
+KEEP_ALIVE_S = 20.0
+"""Longest time (s) between two frames to the satellite, whose link forgets a UDP sender after a minute."""
 FRAME_OVERHEAD_BYTES = frames.TELECOMMAND_HEADER.size + security.OVERHEAD_BYTES + CRC_BYTES
 """Number of bytes that a telecommand frame adds to its packet."""
 _LINK, _VERIFICATION = (LAYOUTS[packet.name].identifier.to_bytes(2, "big") for packet in (LINK, VERIFICATION))

@@ -68,6 +68,18 @@ def test_the_console_requests_telemetry_once_and_returns_what_the_flight_records
     assert feed.silence < 60.0
 
 
+def test_the_console_sends_a_ping_every_20_s_so_that_the_link_does_not_forget_it(
+    satellite: Satellite,
+) -> None:
+    """Otherwise a UDP line discards the live telemetry of some seconds in each minute."""
+    ends, feed = satellite.ends, satellite.feed
+    for age, pings in ((0.0, 1), (19.0, 1), (21.0, 2)):
+        feed._received = time.monotonic()
+        feed._asked -= age
+        feed.new()
+        assert len(ends.obeyed) == pings
+
+
 def test_telemetry_arrives_while_the_network_refuses_the_pings(
     satellite: Satellite, monkeypatch: pytest.MonkeyPatch
 ) -> None:

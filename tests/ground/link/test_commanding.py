@@ -148,6 +148,27 @@ def test_a_ping_follows_each_silence_so_that_a_restarted_link_knows_the_ground()
     assert [unpack(packet) for packet in double.sent[1:]] == [Ping()] * 3
 
 
+def test_a_ping_follows_every_20_s_so_that_the_link_does_not_forget_the_ground() -> None:
+    """Otherwise a UDP line discards the reports of some seconds in each minute."""
+
+    class Heard(FakeTerminal):
+        def follow(self, *_: Any, **__: Any) -> Iterator[Report]:
+            self.gate.admitted += 1
+            return iter([report(Stage.ACCEPTED)])
+
+    double: Any = Heard()
+    commanding.command(double, b"x", 1, 60.0, lambda _: None)
+    assert [unpack(packet) for packet in double.sent[1:]] == [Ping()] * 2
+
+
+def test_a_file_session_without_units_to_send_sends_a_ping_every_20_s(tmp_path: Path) -> None:
+    line = terminal()
+    files = session(tmp_path, line)
+    for second in range(66):
+        files.transmit(second * 10**9)
+    assert [unpack(packet) for packet in line.sent] == [Ping()] * 3
+
+
 def test_a_command_is_followed_until_its_caller_has_seen_enough() -> None:
     answers = [report(Stage.ACCEPTED), report(Stage.STARTED), report(Stage.STARTED)]
     found = commanding.command(
