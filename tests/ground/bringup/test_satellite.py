@@ -410,7 +410,7 @@ def test_strings_on_the_same_panel_are_not_exchanged() -> None:
 def test_strings_whose_currents_never_change_are_stuck() -> None:
     (found,) = step_strings(strings_bench(np.zeros((3, 3)), np.array([0.01, 0.03, 0.0]))[0]).findings
     assert (found.part, found.kind) == ("solar_strings", "stuck")
-    assert "(30 mA)" in found.text
+    assert "largest 30 mA" in found.text
 
 
 @pytest.mark.parametrize(("age_s", "problem"), [(1.3, "no conversion arrives"), (-1.0, "bus lost")])
