@@ -261,6 +261,25 @@ def _find(
     return replace(second, pixels_read=read + second.pixels_read)
 
 
+_MOST_LOST, _LOST_STEP = 0.25, 16
+"""Largest fraction of the rows that count as lost, and step between the pixels that are compared first."""
+
+
+def _lost_rows(image: Image) -> BoolArray:
+    """Return the mask (rows,) of rows that were lost in the transfer of an image.
+
+    All pixels of a lost row are equal, such as zero, and there are other rows above and below. Rows of the
+    dark sky may be equal too, but are at the upper or lower edge of the image.
+    """
+    lost = np.all(image[:, ::_LOST_STEP] == image[:, :1], axis=1)
+    lost[lost] = np.all(image[lost] == image[lost, :1], axis=1)
+    other = np.flatnonzero(~lost)
+    if not lost.any() or not len(other):
+        return np.zeros(len(image), dtype=np.bool_)
+    lost[: other[0]] = lost[other[-1] :] = False
+    return lost & (np.count_nonzero(lost) <= _MOST_LOST * len(image))
+
+
 class _ScannedImage:
     """An image whose edges and cones are kept for further searches with other knowledge of directions."""
 
@@ -268,6 +287,10 @@ class _ScannedImage:
         """Keep an image and its mask. Raises ArgumentError for the same reasons as `find_nadir`."""
         self.image = image_of_camera(image, camera)
         self.camera, self.hidden = camera, None if hidden is None else _mask(hidden, camera)
+        lost = _lost_rows(self.image)
+        if lost.any():
+            rows = np.broadcast_to(lost[:, None], self.image.shape)
+            self.hidden = np.array(rows if self.hidden is None else self.hidden | rows)
         self._observed: dict[int, tuple[Observation, ScanLines, list[_FreeCone]]] = {}
 
     def observed(self, settings: EdgeSettings) -> tuple[Observation, ScanLines, list[_FreeCone]]:

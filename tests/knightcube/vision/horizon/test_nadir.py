@@ -131,6 +131,34 @@ def test_only_the_scanned_lines_are_read(day: tuple[EarthScene, Image]) -> None:
     assert lines.columns.tolist() == lines.rows.tolist() == list(range(32, 512, 64))
 
 
+@pytest.mark.parametrize(("value", "rows"), [(0, 1), (0, 40), (255, 2)])
+def test_lost_rows_are_not_evaluated(day: tuple[EarthScene, Image], value: int, rows: int) -> None:
+    """Lost rows do not change the black level, and their edges do not count.
+
+    A camera with an offset has no pixels of zero counts, unless they were lost.
+    """
+    scene, image = day
+    whole = find_nadir(image, MODEL.lens, _gps(scene), SETTINGS)
+    lost = image.copy()
+    for first in (100, 300, 420):
+        lost[first : first + rows] = value
+    found = find_nadir(lost, MODEL.lens, _gps(scene), SETTINGS)
+    assert _error_deg(found, scene) < _error_deg(whole, scene) + 0.05
+    assert np.all((found.points[:, 1] < 99.0) | (found.points[:, 1] > 100.0 + rows))
+
+
+def test_only_whole_rows_between_other_rows_count_as_lost() -> None:
+    image = np.arange(64 * 48, dtype=np.uint16).reshape(64, 48)
+    assert not nadir_module._lost_rows(image).any()
+    image[[0, 1, 20, 21, 63]] = 7
+    assert np.flatnonzero(nadir_module._lost_rows(image)).tolist() == [20, 21]
+    image[21, 5] = 8
+    assert np.flatnonzero(nadir_module._lost_rows(image)).tolist() == [20]
+    image[10:40] = 0
+    assert not nadir_module._lost_rows(image).any()
+    assert not nadir_module._lost_rows(0 * image).any()
+
+
 def test_a_rough_attitude_gives_what_the_coarse_sensors_give(day: tuple[EarthScene, Image]) -> None:
     scene, frame = day
     tilted = quaternion.multiply(quaternion.from_rotation_vector(np.full(3, 0.02)), scene.attitude)
