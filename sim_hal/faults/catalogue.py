@@ -782,7 +782,7 @@ _ALL = (
     _fault("strings: off", "no power: no converter acknowledges", _parts_off),
     _fault(
         "strings: dead",
-        "a string gives no current; 0 is all strings",
+        "a string gives no current",
         _dead,
         {"string": _count(1.0, 0.0, 4.0)},
     ),
@@ -814,7 +814,7 @@ _ALL = (
     ),
     _fault(
         "panels: lost",
-        "a panel gives no power; 0 is all panels",
+        "a panel gives no power",
         _held("lost_panel", lambda _, given: round(given["panel"]), None),
         {"panel": _count(1.0, 0.0, 32.0)},
     ),
@@ -843,7 +843,7 @@ def listing() -> str:
     lines = []
     for kind in CATALOGUE.values():
         given = ", ".join(
-            f"{name}={'drawn' if parameter.default is None else f'{parameter.default:g}'}"
+            f"{name}={'random' if parameter.default is None else f'{parameter.default:g}'}"
             for name, parameter in kind.parameters.items()
         )
         name = f"{kind.name} ({given})" if given else kind.name

@@ -164,6 +164,7 @@ def _faults_help() -> str:
     return (
         f"\nfaults: {grammar}\n"
         "  Seconds are of mission time; without @ a fault begins at 0, without `for` it lasts to the end.\n"
+        "  The number 0 of a camera, string or panel means all of them.\n"
         "  In a configuration: simulation: {faults: [{fault: 'imu: silent', at: 120, for: 5}]}\n"
         f"\n{listing}\n"
     )

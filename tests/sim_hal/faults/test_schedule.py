@@ -95,7 +95,7 @@ def test_every_device_has_faults_and_every_fault_is_listed() -> None:
 
 def test_the_list_states_random_and_optional_parameters() -> None:
     (line,) = [line for line in listing().splitlines() if line.strip().startswith("pwm: upset")]
-    assert "(register=drawn, bit=drawn)" in line
+    assert "(register=random, bit=random)" in line
     assert "register one of 0, 1, 6 to 69, 254;" in line
     with pytest.raises(UsageError, match="one of 0, 5"):
         parse("monitor: upset (register=1)")
