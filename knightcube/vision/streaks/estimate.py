@@ -387,7 +387,7 @@ def _rejection(
     whole = complete_streaks(camera.pinhole, last.scene.motion, camera.shutter, used, margin)
     checks = (
         (not whole.any(), "no streak has both ends in the frame: expose for a shorter time"),
-        (last.last_step > _UNSETTLED, "the fit did not settle"),
+        (last.last_step > _UNSETTLED, "the fit did not converge"),
         (
             not result.misfit < settings.worst_misfit and not known.aside < settings.worst_displacement,
             f"the streaks do not fit the model: misfit {result.misfit:.1f}",

@@ -337,7 +337,7 @@ def test_an_accepted_motion_has_a_rate_with_its_covariance(monkeypatch: pytest.M
 @pytest.mark.parametrize(
     ("known", "options", "text"),
     [
-        ({}, {"last_step": 2.1}, "the fit did not settle"),
+        ({}, {"last_step": 2.1}, "the fit did not converge"),
         ({"aside": 0.5}, {"change": lambda one: replace(one, misfit=4.2)}, "misfit 4.2"),
         ({}, {"verdict": StreakVerdict.REJECTED}, "segments"),
         ({"common_motion": CommonMotion(0.06, 0.01)}, {}, "0.06 px across and 1 %"),
