@@ -459,7 +459,7 @@ class _Search:
                 on_horizon=np.zeros(len(points), dtype=bool),
                 pixels_read=self.read,
             )
-        status, reason = _judged(hypotheses)
+        status, reason = _judged(hypotheses, points[:, 1])
         best, found = hypotheses[0], status is HorizonStatus.FOUND
         measured = [self.measured(each) for each in hypotheses]
         return HorizonSolution(
@@ -568,8 +568,13 @@ def _next_cone(
     return _FreeCone(cone, int(np.count_nonzero(cone.members & free)), left)
 
 
-def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
-    """Return the status of the search and the reason, from the hypotheses in descending order of quality."""
+def _judged(hypotheses: list[Hypothesis], row: FloatArray) -> tuple[HorizonStatus, str]:
+    """Return the status of the search and the reason, from the hypotheses in descending order of quality.
+
+    A refused horizon makes the best horizon ambiguous too if its edges are all above or all below those of
+    the best horizon. If a part of the image is displaced, or from another exposure, each part has a horizon,
+    of which the limb is missing in the other part. The argument `row` (n,) has the row of each edge.
+    """
     best = hypotheses[0]
     flaw = _flaw(best)
     if flaw:
@@ -577,9 +582,15 @@ def _judged(hypotheses: list[Hypothesis]) -> tuple[HorizonStatus, str]:
     count = np.count_nonzero(best.members)
     for other in hypotheses[1:]:
         apart = _angle(other.fit.view.nadir, best.fit.view.nadir)
-        own = np.count_nonzero(other.members & ~best.members)
-        if not _flaw(other) and apart > _SAME and own > _RIVAL * count:
+        own = other.members & ~best.members
+        if apart <= _SAME or np.count_nonzero(own) <= _RIVAL * count:
+            continue
+        if not _flaw(other):
             return HorizonStatus.AMBIGUOUS, f"two horizons {np.degrees(apart):.1f} deg apart"
+        mine, others = row[best.members], row[own]
+        if not _contradiction(other) and (mine.max() <= others.min() or others.max() <= mine.min()):
+            torn = "a part of the image is displaced or from another exposure"
+            return HorizonStatus.AMBIGUOUS, f"two horizons in different rows: {torn}"
     return HorizonStatus.FOUND, ""
 
 

@@ -147,6 +147,16 @@ def test_lost_rows_are_not_evaluated(day: tuple[EarthScene, Image], value: int, 
     assert np.all((found.points[:, 1] < 99.0) | (found.points[:, 1] > 100.0 + rows))
 
 
+def test_a_torn_image_is_ambiguous(day: tuple[EarthScene, Image]) -> None:
+    """If the lower rows are from another exposure, each part has a horizon, and the nadir is ambiguous."""
+    scene, image = day
+    torn = np.concatenate([image[:300], np.roll(image, 40, axis=0)[300:]])
+    assert find_nadir(image, MODEL.lens, _gps(scene), SETTINGS)
+    found = find_nadir(torn, MODEL.lens, _gps(scene), SETTINGS)
+    assert found.status is HorizonStatus.AMBIGUOUS
+    assert "a part of the image is displaced" in found.reason
+
+
 def test_only_whole_rows_between_other_rows_count_as_lost() -> None:
     image = np.arange(64 * 48, dtype=np.uint16).reshape(64, 48)
     assert not nadir_module._lost_rows(image).any()
