@@ -1,6 +1,7 @@
 #!/bin/sh
 # Install the KnightCube flight software as a systemd service. Run the script again to update the software.
 set -eu
+umask 022 # the services, which run as other users, read what this script installs
 
 usage() {
     cat <<'TEXT'

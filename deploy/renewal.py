@@ -655,7 +655,9 @@ class Renewal:
             if done.returncode == 0:
                 return dict(json.loads(done.stdout))
             problems += done.stderr.strip().splitlines()[-1:] or [f"status {done.returncode}"]
-        raise Refused([*problems, "no release or no root.json is installed: run deploy/install.sh"][0])
+        raise Refused(
+            [*problems, "no release or no root.json is installed and readable: run deploy/install.sh"][0]
+        )
 
     def _confirm(self, name: str, kind: str) -> None:
         """End the trial and keep the new version. Raises Refused if the trial cannot be confirmed."""
@@ -947,22 +949,22 @@ def main(words: Sequence[str]) -> int:
     parser.add_argument("--restart", action="store_true", help="restart the services as requested by a run")
     options = parser.parse_args(words)
     board = Board(options.root)
-    board.own.mkdir(parents=True, exist_ok=True)
-    with open(board.own / "lock", "a", encoding="ascii") as lock:
-        try:
-            fcntl.flock(lock, fcntl.LOCK_EX | (0 if options.accepted else fcntl.LOCK_NB))
-        except OSError:
-            return 0  # an earlier run is still building a release
-        try:
+    try:
+        board.own.mkdir(parents=True, exist_ok=True)
+        with open(board.own / "lock", "a", encoding="ascii") as lock:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | (0 if options.accepted else fcntl.LOCK_NB))
+            except BlockingIOError:
+                return 0  # an earlier run is still building a release
             if options.restart:
                 board.restart_parts()
             else:
                 now, clock = options.now, time.CLOCK_BOOTTIME
                 one = Renewal(board, lambda: time.clock_gettime(clock) if now is None else now, boot_id())
                 one.accept(options.accepted) if options.accepted else one.step()
-        except OSError as error:
-            sys.stderr.write(f"renewal: {error}\n")
-            return 1
+    except OSError as error:
+        sys.stderr.write(f"renewal: {error}\n")
+        return 1
     return 0
 
 

@@ -17,6 +17,7 @@ from packaging.specifiers import SpecifierSet
 
 from knightcube.vision.startracker.index import build
 from sim_hal.faults.host import corrupted
+from tests.deploy.boards import FakeBoard
 from tests.deploy.scripts import DEPLOY, ROOT, TESTBED, changed_testbed, script
 from tests.support.flights import CONFIG
 
@@ -63,6 +64,25 @@ class Image:
 
     def files(self) -> dict[Path, float]:
         return {path: path.lstat().st_mtime for path in self.root.rglob("*") if not path.is_dir()}
+
+
+def test_the_services_can_read_what_root_installs_with_any_umask(tmp_path: Path) -> None:
+    """The services run as other users, and root often has the umask 077."""
+    board = FakeBoard(tmp_path / "root")
+    board.root.mkdir()
+    board.python("new")  # the interpreter of the machine can be read by all users
+    before = os.umask(0o077)
+    try:
+        board.install("new")
+    finally:
+        os.umask(before)
+    hidden = [
+        str(path)
+        for folder in (board.prefix, board.root / "etc")
+        for path in [folder, *folder.rglob("*")]
+        if not path.is_symlink() and not path.stat().st_mode & 0o004
+    ]
+    assert hidden == []
 
 
 @pytest.fixture(scope="module")

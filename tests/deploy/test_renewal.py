@@ -6,6 +6,7 @@ import contextlib
 import errno
 import io
 import json
+import os
 import shutil
 import subprocess
 import tarfile
@@ -364,6 +365,42 @@ def running_the_old_release(board: RenewedBoard, unit: str) -> Iterator[None]:
         (board.place / f"pid-{unit}").write_text(f"{process.pid}\n", encoding="ascii")
         yield
         process.kill()
+
+
+@pytest.mark.skipif(shutil.which("setpriv") is None, reason="setpriv is missing: install util-linux")
+@pytest.mark.parametrize(
+    ("path", "mode"),
+    [
+        ("etc/knightcube", 0o555),
+        ("etc/knightcube/flight.yaml", 0),
+        ("var/lib/knightcube-renewal", 0o555),
+        ("var/lib/knightcube-renewal", 0),
+        ("var/lib/knightcube-link", 0),
+        ("opt/knightcube/releases", 0),
+    ],
+)
+def test_a_trial_ends_although_files_deny_access_at_its_end(
+    board: RenewedBoard, path: str, mode: int
+) -> None:
+    """When the trial is over, even root is denied access, and the next run completes the return.
+
+    Without the two capabilities, the permissions of the owner apply to root.
+    """
+    activated(board)
+    board.now += 3600.0
+    limits = [f"--{kind}=-dac_override,-dac_read_search" for kind in ("bounding-set", "inh-caps")]
+    words = ["setpriv", *(limits if os.geteuid() == 0 else ["--no-new-privs"]), *board.words()]
+    denied = board.root / path
+    before = denied.stat().st_mode
+    denied.chmod(mode)
+    try:
+        done = subprocess.run(words, env=board.environment(), capture_output=True, text=True, check=False)
+    finally:
+        denied.chmod(before)
+    assert "Traceback" not in done.stderr
+    assert done.returncode == 0 or done.stderr.startswith("renewal: [Errno 13] Permission denied")
+    board.step()
+    assert board.flown() == "testbed"
 
 
 @pytest.mark.parametrize("unit", ["knightcube.service", "knightcube-link.service"])
