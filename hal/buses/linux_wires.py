@@ -36,6 +36,7 @@ from hal.interfaces.wires import SECOND_NS, Clock
 
 _READ_TIMEOUT_S = 0.1  # longest time (s) until the thread notices that the port is to be closed
 _WRITE_TIMEOUT_S = 0.005  # longest time (s) to wait while the kernel's buffer is full, a fifth of a cycle
+_CLOSE_S = 2.0  # longest time (s) to wait for the thread at the end
 _PENDING_LIMIT = 1 << 16
 _REOPEN_S = 0.25
 
@@ -140,10 +141,13 @@ class PySerialPort:
         if self._closing.is_set():
             return
         self._closing.set()
-        with self._port_lock:
+        is_held = self._port_lock.acquire(timeout=_CLOSE_S)  # otherwise the thread is closing the port
+        if is_held:
             self._serial.cancel_read()  # has no effect on a port that is not open
-        self._thread.join(timeout=2.0)
-        self._serial.close()
+            self._port_lock.release()
+        self._thread.join(timeout=_CLOSE_S)
+        if is_held:
+            self._serial.close()
         self._failure = self._failure or "the port was closed"
 
     @contextmanager

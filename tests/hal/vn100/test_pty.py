@@ -294,12 +294,14 @@ def test_a_port_that_its_thread_closes_slowly_is_not_waited_for(
     cable: Cable, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     """The kernel waits up to 30 s for the output queue of a serial port that is closed."""
-    port, closing, closed = cable.port, threading.Event(), threading.Event()
+    monkeypatch.setattr(linux_wires, "_CLOSE_S", 0.01)
+    port, closing, may_close, closed = cable.port, *(threading.Event() for _ in range(3))
     close = port._serial.close
 
     def slowly() -> None:
         closing.set()
-        assert closed.wait(10.0)
+        may_close.wait(10.0)
+        closed.set()
         close()
 
     monkeypatch.setattr(port._serial, "close", slowly)
@@ -309,10 +311,12 @@ def test_a_port_that_its_thread_closes_slowly_is_not_waited_for(
     for call in (partial(port.send, b"?"), partial(port.set_baud_rate, 57600)):
         with pytest.raises(NotResponding, match="is being closed"):
             call()
-    assert not closed.is_set()
-    closed.set()
     assert port.baud_rate == 57600
-    cable.plug()
+    port.close()
+    assert not closed.is_set()
+    may_close.set()
+    port._thread.join()
+    assert closed.is_set()
 
 
 class InterruptedClock(SystemClock):
