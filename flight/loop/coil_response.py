@@ -16,6 +16,11 @@ are healthy. The gains of healthy coils may differ from 1 by the relative errors
 dipoles. A fault of an axis is diagnosed only if it explains the motion clearly better than a fault of another
 axis. A coil is considered reversed if a reversed coil explains the motion far better than healthy coils.
 
+The axes of healthy coils differ from the configured axes. In a field along the axis of a strong coil, a tilt
+of this coil by some degrees causes as much torque as half the dipole of a weak coil. For a free body, the fit
+therefore estimates the tilts as nuisance parameters, so that the standard deviations of the gains include the
+uncertainty of the axes.
+
 While a free body tumbles, its gyroscopic acceleration is a hundred times the acceleration by the coils, so
 that an inertia error of 2 % can make healthy coils appear reversed. The fit therefore subtracts the
 gyroscopic acceleration for the assumed inertia, and estimates the remaining error by nuisance parameters
@@ -45,7 +50,7 @@ import numpy as np
 
 from flight.loop.coil_currents import NEWEST, Bounds, CoilFault, Supplied
 from hal.interfaces.devices import NO_AXES, Axes, PowerReading
-from knightcube.astro.arrays import FloatArray, IntArray
+from knightcube.astro.arrays import FloatArray, IntArray, tangent_basis
 from knightcube.compiled import compiled_form_of
 from knightcube.gnc.estimation.rigid_body import (
     BodyErrors,
@@ -190,14 +195,16 @@ _SLOWEST_ROTATION = 1.1e-3
 """Rate (rad/s) at which the air flow rotates in the axes of a body that points to an inertial target."""
 _GAIN_PRIOR = 10.0
 """Prior standard deviation of a gain that a hypothesis does not restrict."""
+_LEAST_TILT = 0.01
+"""Lower limit of the largest error (rad) assumed for the axis of a coil."""
 _LEAST_GAIN_ERROR = 0.05
 """Smallest error assumed for the gain of a healthy coil."""
 _WEAK_GAIN, _SIGMAS = 0.7, 2.5
 """Largest gain of a coil that is reported as weak, and number of standard deviations by which the estimate
 must be below this gain."""
 _USED_WEAK_GAIN = 0.6
-"""Gain below which a weak coil is used with its estimated gain. Coil misalignments, which the fit neglects,
-can make a true gain of 0.8 appear as small as 0.5."""
+"""Gain below which a weak coil is used with its estimated gain. The gain is well below 1, because the axes of
+the coils can differ from the configured axes by more than assumed."""
 _STRONG_GAIN = 1.25
 """Gain above which a coil counts as stronger than assumed."""
 LEAST_GAIN, _EXACT = 0.1, 0.1
@@ -229,14 +236,14 @@ class CoilResponse:
         if dipoles.ndim == 0:
             dipoles = np.eye(3) * dipoles
         strongest = float(np.linalg.norm(dipoles, axis=0).max())
-        # Row a is the axis of coil a, scaled by its dipole relative to the strongest coil's dipole.
-        directions = dipoles.T / strongest
-        self._count_of_coils = coils = len(directions)
-        # Accelerations per ampere (3, 3 n): row b is for a unit field along body axis b, with three columns
-        # per coil. Coil a, whose dipole per ampere is d_a, causes the acceleration J^-1 (d_a x B).
-        torques = np.cross(directions, np.eye(3)[:, None])
-        per_field = torques @ (strongest * np.linalg.inv(settings.inertia).T)
-        self._per_field: FloatArray = per_field.reshape(3, 3 * coils)
+        self._count_of_coils = coils = dipoles.shape[1]
+        # The last n rows are the dipoles of the coils, relative to the strongest coil's dipole.
+        directions = _with_tilts(dipoles.T / strongest) if all(settings.free) else dipoles.T / strongest
+        self._tilts = len(directions) - coils
+        # Accelerations per ampere (3, 3 m): row b is for a unit field along body axis b, with three columns
+        # per row of `directions`. A dipole per ampere d causes the acceleration J^-1 (d x B).
+        torques = strongest * np.cross(directions, np.eye(3)[:, None])
+        self._per_field: FloatArray = (torques @ np.linalg.inv(settings.inertia).T).reshape(3, -1)
         self._free = np.flatnonzero(settings.free)
         self._mask: FloatArray = np.array(settings.free, dtype=float)
         count = len(self._free)
@@ -247,8 +254,10 @@ class CoilResponse:
             modes = coefficient_modes(settings.inertia, settings.errors)
             self._gyroscopic = np.vstack([gyroscopic_coefficients(settings.inertia), *modes])
         errors = len(self._gyroscopic) // 3 - 1
-        # Fit parameters: torsion and damping of each free axis, a weight of each error mode, and the gains.
+        # Fit parameters: torsion and damping of each free axis, a weight of each error mode, the tilts of the
+        # coils' axes, and the gains.
         spreads = [settings.torsion] * count + [settings.damping] * count + [1.0] * errors
+        spreads += [max(settings.errors.coil_axes, _LEAST_TILT) / math.sqrt(3.0)] * self._tilts
         self._others = len(spreads)
         self._prior: FloatArray = 1.0 / np.array(spreads) ** 2
         # Prior weight (inverse variance) of a healthy coil's gain, whose error is uniformly distributed.
@@ -280,7 +289,7 @@ class CoilResponse:
         self._times: list[int] = []  # times (ns) of the samples
         # Time (s), sums and motion of the last bin, as `_bin_equations` needs them for the next bin.
         self._middle: float | None = None
-        self._sums: FloatArray = np.zeros((2, 3 * coils + 6))
+        self._sums: FloatArray = np.zeros((2, self._per_field.shape[1] + 6))
         self._motion: FloatArray = np.zeros((2, 3))
         self._quiet_field: tuple[float, ...] | None = None
         # Equations (f, p + 1) of each bin for f free axes: coefficients of p parameters, and acceleration.
@@ -364,7 +373,8 @@ class CoilResponse:
         after = [(rows, field) for time_ns, rows, field in self._history if time_ns >= settled_ns]
         if len(before) < 3 or len(after) < 3:
             return math.nan
-        column, per_field = self._others + axis, constant * self._per_field[:, 3 * axis : 3 * axis + 3]
+        column, first = self._others + axis, 3 * (self._tilts + axis)
+        per_field = constant * self._per_field[:, first : first + 3]
         changes = [np.array(field) @ per_field - rows[:, column] for rows, field in after]
         expected: FloatArray = np.mean(changes, axis=0)
         expected *= self._mask
@@ -377,7 +387,9 @@ class CoilResponse:
     def _residual(self, equations: list[FloatArray]) -> FloatArray:
         """Return the mean residual acceleration (3,) of equations (3, p + 1), assuming healthy coils."""
         rows = np.mean(equations, axis=0)
-        modes, gains = rows[:, 2 * len(self._free) : self._others], rows[:, self._others : -1]
+        # The tilts are left out, because those of the newest fit can contain the effect of a fault.
+        first = 2 * len(self._free)
+        modes, gains = rows[:, first : first + len(self._weights)], rows[:, self._others : -1]
         return np.asarray(rows[:, -1] - gains.sum(axis=1) - modes @ self._weights)
 
     @property
@@ -389,7 +401,7 @@ class CoilResponse:
         if self._quiet_field is None:
             return None
         per_ampere = np.array(self._quiet_field) @ self._per_field
-        return np.asarray(np.linalg.norm(per_ampere.reshape(-1, 3), axis=1))
+        return np.asarray(np.linalg.norm(per_ampere.reshape(-1, 3)[self._tilts :], axis=1))
 
     def text(self, axis: int) -> str:
         """Return the gain of an axis as text."""
@@ -397,6 +409,8 @@ class CoilResponse:
 
     def _close_bin(self) -> bool:
         samples, field = np.array(self._samples), self._samples[-1][4:7]
+        if self._tilts:  # the two tilts of a coil act like coils with the same current
+            samples = np.concatenate([samples, samples[:, 7:], samples[:, 7:]], axis=1)
         middle = sum(self._times) / len(samples) * 1e-9
         self._samples.clear()
         self._times.clear()
@@ -468,7 +482,9 @@ class CoilResponse:
             single = [gain[axis + 1][axis] for axis in range(coils)]
             sigma = [math.sqrt(spread * variance[axis + 1][axis]) for axis in range(coils)]
             judged = _judged([each / spread for each in cost])
-            fits.append(MotionFit(single, sigma, other[2 * free :], possible, *judged))
+            fits.append(
+                MotionFit(single, sigma, other[2 * free : self._others - self._tilts], possible, *judged)
+            )
         return fits
 
     def _count(self, axis: int, possible: bool, *, alone: bool, is_reversed: bool, is_steady: bool) -> None:
@@ -529,6 +545,13 @@ class CoilResponse:
             self._disturbed_ns, self._disturbance = self._last_ns, disturbance(self._last_ns)
         walks = 2.0 * self._disturbance[self._free] ** 2 * max(self._speeds[-1], _SLOWEST_ROTATION)
         return [2.0 ** round(math.log2(walk)) if walk > 0.0 else 0.0 for walk in walks.tolist()]
+
+
+def _with_tilts(dipoles: FloatArray) -> FloatArray:
+    """Return the changes (2 n, 3) of dipoles (n, 3) by tilts of 1 rad in two directions, and the dipoles."""
+    sizes = np.linalg.norm(dipoles, axis=1).tolist()
+    tilts = [size * tangent_basis(row / size) for row, size in zip(dipoles, sizes, strict=True)]
+    return np.concatenate([*np.stack(tilts, axis=1), dipoles])
 
 
 @functools.cache

@@ -596,3 +596,35 @@ def test_a_disturbance_about_one_axis_affects_only_the_gains_that_act_about_it()
         sigmas.append(response.sigma)
     assert sigmas[1][0] == pytest.approx(sigmas[0][0], rel=0.05)
     assert sigmas[1][2] > 1.5 * sigmas[0][2]
+
+
+@pytest.mark.parametrize("tilt", [-0.052, 0.052])
+@pytest.mark.parametrize("gain", [1.0, 0.0])
+def test_a_tilted_strong_coil_does_not_falsify_the_gain_of_a_weak_coil(tilt: float, gain: float) -> None:
+    """The strong coil y is tilted by 4 deg in a field along its axis; the weak coil z has half its dipole.
+
+    The commands of both coils are proportional, as at the end of detumbling. The gain of a healthy weak coil
+    is estimated within its uncertainty, and a weak coil without torque is found.
+    """
+    configured = np.diag([0.65, 0.65, 0.3])
+    true = configured + 0.65 * tilt * np.outer([-1.0, 0.0, -1.0], [0.0, 1.0, 0.0])
+    true[:, 2] *= gain
+    settings = ResponseSettings(
+        INERTIAS, configured, 2.8e-4, bin_samples=40, bins=40, least_bins=8, model_error=3e-5,
+        torsion=1e-6, damping=1e-4, settle_ns=100_000_000,
+    )  # fmt: skip
+    response, noise = CoilResponse(settings), np.random.default_rng(5)
+    rate, field = np.array([-0.009, -0.012, 0.02]), np.array([5e-6, -4.3e-5, -5e-6])
+    feeble = False
+    for cycle in range(1600):
+        now_ns = cycle * TICK_NS
+        currents = math.exp(-cycle / 600) * np.array([0.0, -0.14, -0.1]) * float(cycle % 160 >= 8)
+        response.commanded(now_ns, tuple(currents.tolist()))
+        rate, field = _moved(rate, field, true @ currents, MOMENTS)
+        measured = rate + 2.8e-4 * noise.standard_normal(3)
+        response.observe_motion(now_ns + TICK_NS, measured, field + 7.7e-4 * true @ currents)
+        feeble = feeble or 2 in response.axes(Finding.FEEBLE)
+    if gain:
+        assert (np.abs(response.gain - 1.0) < 3.0 * response.sigma).all()
+        assert response.sigma[1:].max() < 0.15
+    assert feeble == (not gain)
