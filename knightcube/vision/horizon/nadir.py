@@ -277,7 +277,7 @@ def _lost_rows(image: Image) -> BoolArray:
     if not lost.any() or not len(other):
         return np.zeros(len(image), dtype=np.bool_)
     lost[: other[0]] = lost[other[-1] :] = False
-    return lost & (np.count_nonzero(lost) <= _MOST_LOST * len(image))
+    return np.asarray(lost & (np.count_nonzero(lost) <= _MOST_LOST * len(image)))
 
 
 class _ScannedImage:
