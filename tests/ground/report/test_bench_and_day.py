@@ -226,7 +226,7 @@ def test_a_pass_of_half_a_minute_is_visible() -> None:
             return [SimpleNamespace(station=stations[0], **ends, elevation_deg=5.0)]
 
     figure = day_figure(Short(STATIONS), STATIONS, [])  # type: ignore[arg-type]
-    canvas = FigureCanvasAgg(figure)
+    canvas: Any = FigureCanvasAgg(figure)
     canvas.draw()
     below = figure.axes[1]
     instant = float(date2num(at(9.0)))  # type: ignore[no-untyped-call]
