@@ -271,7 +271,7 @@ def _lost_rows(image: Image) -> BoolArray:
     All pixels of a lost row are equal, such as zero, and there are other rows above and below. Rows of the
     dark sky may be equal too, but are at the upper or lower edge of the image.
     """
-    lost = np.all(image[:, ::_LOST_STEP] == image[:, :1], axis=1)
+    lost: BoolArray = np.all(image[:, ::_LOST_STEP] == image[:, :1], axis=1)
     lost[lost] = np.all(image[lost] == image[lost, :1], axis=1)
     other = np.flatnonzero(~lost)
     if not lost.any() or not len(other):
