@@ -12,8 +12,11 @@ unknown, the measured field is assumed to continue to rotate at the present rate
 equator, however, the field's direction only oscillates by some 20 deg. In contrast to B-dot control, this
 detumbler also removes a spin along the field as soon as the field has rotated. The coils stay off until
 `TRUSTED` consecutive samples, also samples outside the pauses, agree with the prediction of the filter and
-the standard deviation of the rate across the field is below `BOUNDED`. The coils are switched off again if no
-sample was accepted for `SILENT_PERIODS` periods, because a restarted sensor may give only unusable fields.
+the standard deviation of the rate across the field is below `BOUNDED`. Without a gyro, the coils also stay
+off during the time `LISTENED` after the begin. A plan needs the direction in which the field rotates, and
+continuous samples show this direction much sooner than samples in pauses. A plan with a wrong direction adds
+momentum. The coils are switched off again if no sample was accepted for `SILENT_PERIODS` periods, because a
+restarted sensor may give only unusable fields.
 
 The filter also estimates the bias of the magnetometer and the matrix of the coils, so a dead or reversed coil
 falsifies neither the rate nor the plan. If the measured field usually changes during the pauses, the field of
@@ -300,6 +303,9 @@ TRUSTED = 4
 """Number of consecutive samples that must agree with the filter before the coils are driven."""
 BOUNDED = 0.02
 """Largest standard deviation (rad/s) of the rate across the field at which the coils may be driven."""
+LISTENED = 10_000_000_000
+"""Time (ns) after `begin` in which the coils stay off, unless the standard deviation of every rate component
+is already below `KNOWN`. A gyro causes such a small standard deviation."""
 SILENT_PERIODS = 2
 """Number of coil pauses without an accepted sample after which the coils are switched off again."""
 DRIFT = 0.015
@@ -424,6 +430,7 @@ class FieldDetumbler:
     def begin(self, now_ns: int) -> None:
         """Begin the first pause without knowledge of the field."""
         self._begun_ns = self._time_ns = self._commanded_ns = now_ns
+        self._listened_ns = now_ns + LISTENED
         self._dipole = _NO_DIPOLE
         self._plan: MomentumPlan | None = None
         self._planned_ns = now_ns
@@ -475,17 +482,21 @@ class FieldDetumbler:
             if rate is not None and self._agreed >= TRUSTED:
                 self._filter.measure_rate(rate)
             if not self._bounded:
-                measured = self._filter.field
-                across = np.eye(3) - np.outer(measured, measured) / float(measured @ measured)
-                spread = across @ self._filter.covariance[RATE, RATE] @ across
-                sigma = math.sqrt(float(np.linalg.eigvalsh(spread)[-1]))
-                self._bounded = self._agreed >= TRUSTED and sigma < BOUNDED
+                self._bounded = self._agreed >= TRUSTED and self._is_bounded(time_ns)
         if self._filter.restarts != starts or (not accepted and not self.trusted):
             self._distrust()
         elif self._filter.revisions != revisions:
             self._plan = None  # the plan belongs to the rotation of another estimate
         longest_ns = DRIFT / self.rate_sigma / _SECOND
         self._act_ns = round(min(self._schedule.act_ns, max(longest_ns, self._shortest_ns)))
+
+    def _is_bounded(self, time_ns: int) -> bool:
+        """Return whether the estimated rate at `time_ns` is accurate enough for the coils to be driven."""
+        measured, spread = self._filter.field, self._filter.covariance[RATE, RATE]
+        if time_ns < self._listened_ns and float(np.linalg.eigvalsh(spread)[-1]) >= KNOWN**2:
+            return False
+        across = np.eye(3) - np.outer(measured, measured) / float(measured @ measured)
+        return float(np.linalg.eigvalsh(across @ spread @ across)[-1]) < BOUNDED**2
 
     def dipole(self, now_ns: int) -> FloatArray:
         """Return the dipole moment (3,), A m^2: zero while the field is measured or the rate is unknown."""

@@ -18,8 +18,8 @@ from knightcube.astro.quaternion import IDENTITY, attitude_matrix, from_rotation
 from knightcube.errors import ArgumentError, UsageError
 from knightcube.gnc.control.detumble import WindowSchedule
 from knightcube.gnc.control.field_detumbler import (
-    BOUNDED,
     LIMIT_GAIN,
+    LISTENED,
     SILENT_PERIODS,
     TRUSTED,
     FieldDetumbler,
@@ -206,7 +206,7 @@ def test_a_reversed_coil_is_estimated_and_used() -> None:
 
 def test_the_pauses_become_longer_if_the_coil_field_decays_slowly() -> None:
     """With a time constant of half the configured settling time, the first samples of a pause are wrong."""
-    speeds, law = fly(np.array([0.1, 0.05, 0.03]), 240.0, lag=0.5e-9 * SCHEDULE.settle_ns)
+    speeds, law = fly(np.array([0.1, 0.05, 0.03]), 300.0, lag=0.5e-9 * SCHEDULE.settle_ns)
     assert speeds[-1] < math.radians(0.5)
     assert law.restarts <= 2
     assert not law.listens(law.next_pause_ns + SCHEDULE.settle_ns)
@@ -216,7 +216,7 @@ def test_the_pauses_become_longer_although_the_filter_restarts_after_each_of_the
     """The coil field falsifies the first sample of each pause, and the coils are off after a restart."""
     law, driven_ns, restarts = detumbler(), 0, 0
     law.begin(0)
-    for now_ns in range(0, 12 * SCHEDULE.period_ns, 25_000_000):
+    for now_ns in range(0, LISTENED + 12 * SCHEDULE.period_ns, 25_000_000):
         field = attitude_matrix(from_rotation_vector(np.array([1e-10 * now_ns, 0.0, 0.0]))) @ FIELD
         off_ns = now_ns - driven_ns
         law.sample(now_ns, field + 2e-6 * (off_ns <= SCHEDULE.settle_ns + 25_000_000))
@@ -249,11 +249,10 @@ def test_coils_wait_where_no_sample_is_accepted_any_more() -> None:
             acted |= bool(law.dipole(now_ns).any())
         return acted
 
-    quiet_ns = (2 + SILENT_PERIODS) * SCHEDULE.period_ns
-    assert acts(0, 2 * SCHEDULE.period_ns, 1.0)
-    assert acts(2 * SCHEDULE.period_ns, quiet_ns, math.nan), (
-        "two pauses without a sample do not stop the brake"
-    )
+    silent_ns = LISTENED + 2 * SCHEDULE.period_ns
+    quiet_ns = silent_ns + SILENT_PERIODS * SCHEDULE.period_ns
+    assert acts(0, silent_ns, 1.0)
+    assert acts(silent_ns, quiet_ns, math.nan), "two pauses without a sample do not stop the brake"
     assert not acts(quiet_ns, quiet_ns + 10 * SCHEDULE.period_ns, math.nan)
     assert acts(quiet_ns + 10 * SCHEDULE.period_ns, quiet_ns + 15 * SCHEDULE.period_ns, 1.0)
 
@@ -282,22 +281,24 @@ def test_no_dipole_in_the_pause_nor_before_enough_samples_agree() -> None:
 
 
 @pytest.mark.parametrize("gyro", [True, False])
-def test_the_coils_act_soon_after_the_begin_by_a_rate_that_is_bounded(gyro: bool) -> None:
-    """The coils are driven after 0.6 s with a gyro, and after 1.5 s with a magnetometer alone.
+def test_the_coils_act_soon_with_a_gyro_and_otherwise_after_continuous_field_samples(gyro: bool) -> None:
+    """The coils are driven after 0.6 s with a gyro, and after `LISTENED` with a magnetometer alone.
 
-    A gyro gives the rate at its first sample. With the coils off, the field gives the rate within a second.
+    With only the samples of the coil pauses, the error of the rate would still be 20 mrad/s after 10 s.
     """
     law, rate, rng = detumbler(), np.array([0.1, 0.05, 0.14]), np.random.default_rng(1)
     law.begin(0)
-    for now_ns in range(0, 2_000_000_000, 25_000_000):
+    for now_ns in range(0, LISTENED + SCHEDULE.period_ns, 25_000_000):
         field = attitude_matrix(from_rotation_vector(1e-9 * now_ns * rate)) @ FIELD
         law.sample(now_ns, field + 2e-7 * rng.standard_normal(3), rate + BIAS if gyro else None)
         if law.dipole(now_ns).any():
             break
-    assert SCHEDULE.settle_ns < now_ns <= (600_000_000 if gyro else 1_500_000_000)
     assert law.rate is not None
-    across = np.cross(FIELD, law.rate - rate) / np.linalg.norm(FIELD)
-    assert np.linalg.norm(across) < 3.0 * BOUNDED
+    if gyro:
+        assert SCHEDULE.settle_ns < now_ns <= 600_000_000
+    else:
+        assert LISTENED <= now_ns < LISTENED + SCHEDULE.period_ns
+        assert np.linalg.norm(law.rate - rate) < 0.01
 
 
 LONG = WindowSchedule(100_000_000, 100_000_000, 3_800_000_000)
@@ -310,7 +311,7 @@ def driven(gyro: bool) -> tuple[FieldDetumbler, list[float]]:
     rate, rng = np.array([0.1, 0.05, 0.14]), np.random.default_rng(1)
     law.begin(0)
     begun_ns, found, before = 0, [], False
-    for now_ns in range(0, 20_000_000_000, 25_000_000):
+    for now_ns in range(0, LISTENED + 20_000_000_000, 25_000_000):
         field = attitude_matrix(from_rotation_vector(1e-9 * now_ns * rate)) @ FIELD
         law.sample(now_ns, field + 2e-7 * rng.standard_normal(3), rate + BIAS if gyro else None)
         acts = bool(law.dipole(now_ns).any())
@@ -326,10 +327,10 @@ def driven(gyro: bool) -> tuple[FieldDetumbler, list[float]]:
 
 def test_the_driven_phase_is_short_while_the_rate_is_uncertain_and_long_with_a_gyro() -> None:
     law, alone = driven(gyro=False)
-    assert law.rate_sigma > 0.005
-    assert alone[1:4] == pytest.approx([1.8, 1.8, 1.8], abs=0.05)
+    uncertain = law.rate_sigma
+    assert 1.8 < min(alone[1:4]) < max(alone[1:4]) < 3.0
     law, helped = driven(gyro=True)
-    assert law.rate_sigma < 0.004
+    assert law.rate_sigma < 0.5 * uncertain
     assert helped[1:4] == pytest.approx([3.8, 3.8, 3.8], abs=0.05)
 
 
@@ -343,7 +344,7 @@ def test_after_another_mode_drove_the_coils_they_settle_before_the_first_sample(
 def test_a_sample_taken_while_the_coils_act_or_settle_is_ignored() -> None:
     law = detumbler()
     law.begin(0)
-    for now_ns in range(0, 5_000_000_000, 25_000_000):
+    for now_ns in range(0, LISTENED + 5_000_000_000, 25_000_000):
         law.sample(now_ns, FIELD if law.listens(now_ns) else np.array([1.0, 0.0, 0.0]))
         law.dipole(now_ns)
     assert law.trusted
@@ -478,12 +479,13 @@ def test_a_prediction_of_a_wrong_orbit_is_not_used(strength: float, used: bool) 
     for source in (expected, lambda _: None):
         law = FieldDetumbler(SCHEDULE, settings, noise, source)
         law.begin(0)
-        for cycle in range(60):
+        cycles = LISTENED // CYCLE_NS + 2 * SCHEDULE.period_ns // CYCLE_NS
+        for cycle in range(cycles):
             turned = attitude_matrix(from_rotation_vector(0.1 * cycle * np.array([0.02, 0.08, 0.05])))
             law.dipole(cycle * CYCLE_NS)
             law.sample(cycle * CYCLE_NS, turned @ FIELD)
         assert law.trusted
-        costates.append(law._planned(60 * CYCLE_NS).costate)
+        costates.append(law._planned(cycles * CYCLE_NS).costate)
     assert asked
     assert bool(np.linalg.norm(costates[0] - costates[1]) > 1e-6 * np.linalg.norm(costates[1])) is used
 
@@ -553,7 +555,7 @@ def test_a_magnetometer_noisier_than_configured_detumbles_the_body() -> None:
 def test_detumbling_by_the_magnetometer_is_as_recorded() -> None:
     rate = np.array([0.1, -0.05, 0.08])
     with_gyro, _ = fly(rate, 12.0, gyro=lambda true: true + 1e-3)
-    check(__file__, "detumbled", [fly(rate, 12.0, spikes=0.05)[0], with_gyro], 1e-4)
+    check(__file__, "detumbled", [fly(rate, 22.0, spikes=0.05)[0], with_gyro], 1e-4)
 
 
 @pytest.mark.parametrize(
