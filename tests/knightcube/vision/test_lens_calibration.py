@@ -304,7 +304,10 @@ def test_malformed_frames_are_refused() -> None:
     nan = np.where(points > 500.0, np.nan, points)
     for frames, says in (
         ([], "no frames"),
-        ([good, MatchedFrame(points[:5], sigma, directions)], "frame 1: shapes"),
+        (
+            [good, MatchedFrame(points[:5], sigma, directions)],
+            "frame 1: points, sigma and directions have shapes",
+        ),
         ([MatchedFrame(nan, sigma, directions)], "must be finite"),
         ([MatchedFrame(points, 0.0 * sigma, directions)], "frame 0: sigma"),
         ([MatchedFrame(points[:1], sigma[:1], directions[:1])], "frame 0: 1 observed"),
