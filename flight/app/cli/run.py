@@ -392,6 +392,7 @@ def check(options: argparse.Namespace) -> int:
             verdict.problems += [f"{item.name}: missing" for item in verdict.devices if not item.found]
         else:
             check_simulated_elements(RunRequest(path, Path()), chosen.text, config)
+            _check_unused_paths(verdict)
             _fly(verdict)
     sys.stdout.write(to_json(_facts(verdict)) if options.json else _text(verdict))
     return 1 if verdict.problems else 0
@@ -438,6 +439,26 @@ def _write(path: Path, text: str) -> None:
             file.write(text)
     except OSError as error:
         raise UsageError(f"--merged {path}: cannot be written: {reason_of(error)}") from error
+
+
+def _check_unused_paths(verdict: CheckResult) -> None:
+    """Add problems of the command socket and the state folder, which the flight of a check does not use."""
+    socket, state = verdict.config.commands.socket, verdict.config.state.folder
+    if socket is not None and (reason := _unwritable(Path(socket).parent)):
+        verdict.problems.append(f"commands.socket: cannot be created: {reason}")
+    if state is not None:
+        there = next(folder for folder in (Path(state), *Path(state).absolute().parents) if folder.exists())
+        if reason := _unwritable(there):
+            verdict.warnings.append(f"state.folder: the state cannot be stored: {reason}")
+
+
+def _unwritable(folder: Path) -> str:
+    """Return why no file can be created in a folder, or "" if files can be created."""
+    try:
+        tempfile.TemporaryDirectory(dir=folder).cleanup()
+    except OSError as error:
+        return f"{folder}: {error.strerror}: create it, or correct its permissions"
+    return ""
 
 
 def _fly(verdict: CheckResult) -> None:

@@ -268,8 +268,8 @@ _MOST_LOST, _LOST_STEP = 0.25, 16
 def _lost_rows(image: Image) -> BoolArray:
     """Return the mask (rows,) of rows that were lost in the transfer of an image.
 
-    All pixels of a lost row are equal, such as zero, and there are other rows above and below. Rows of the
-    dark sky may be equal too, but are at the upper or lower edge of the image.
+    All pixels of a lost row are equal, such as zero, and differ from the medians of the nearest other rows
+    above and below. Rows of the dark sky may be equal too, but the median of the next row is then the same.
     """
     lost: BoolArray = np.all(image[:, ::_LOST_STEP] == image[:, :1], axis=1)
     lost[lost] = np.all(image[lost] == image[lost, :1], axis=1)
@@ -277,6 +277,10 @@ def _lost_rows(image: Image) -> BoolArray:
     if not lost.any() or not len(other):
         return np.zeros(len(image), dtype=np.bool_)
     lost[: other[0]] = lost[other[-1] :] = False
+    rows = np.flatnonzero(lost)
+    below = np.searchsorted(other, rows)
+    beside = np.median(image[other[[below - 1, below]]], axis=2)
+    lost[rows] = (beside != image[rows, 0]).all(axis=0)
     return np.asarray(lost & (np.count_nonzero(lost) <= _MOST_LOST * len(image)))
 
 

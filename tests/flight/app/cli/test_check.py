@@ -74,6 +74,19 @@ def test_a_simulation_is_checked_while_another_flight_uses_its_socket_and_its_st
     assert {file.name: file.read_bytes() for file in state.iterdir()} == kept
 
 
+def test_a_command_socket_and_a_state_folder_that_a_flight_cannot_use_are_named(tmp_path: Path) -> None:
+    file = tmp_path / "file"
+    file.touch()
+    mine = write(
+        tmp_path, DEMO, camera="none", steps=[{"at": 0.0, "q2": 0.0}], duration=0.5,
+        commands={"socket": str(tmp_path / "missing/commands")}, state={"folder": str(file / "state")},
+    )  # fmt: skip
+    facts = json.loads(command("check", mine, "--json").stdout)
+    (problem,) = facts["problems"]
+    assert "commands.socket: cannot be created: " in problem and "missing: No such file" in problem
+    assert any(f"state.folder: the state cannot be stored: {file}: Not a directory" in w for w in facts["warnings"])
+
+
 def test_a_configuration_that_extends_another_is_checked_and_written_as_one_file(tmp_path: Path) -> None:
     base = write(tmp_path, DEMO, camera="none", duration=0.5, steps=[{"at": 0.0, "q2": 0.0}])
     top, merged, out = tmp_path / "top.yaml", tmp_path / "merged.yaml", tmp_path / "run"

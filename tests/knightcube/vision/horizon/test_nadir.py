@@ -162,11 +162,15 @@ def test_only_whole_rows_between_other_rows_count_as_lost() -> None:
     assert not nadir_module._lost_rows(image).any()
     image[[0, 1, 20, 21, 63]] = 7
     assert np.flatnonzero(nadir_module._lost_rows(image)).tolist() == [20, 21]
-    image[21, 5] = 8
+    image[21] = image[22]
     assert np.flatnonzero(nadir_module._lost_rows(image)).tolist() == [20]
     image[10:40] = 0
     assert not nadir_module._lost_rows(image).any()
     assert not nadir_module._lost_rows(0 * image).any()
+    dark_sky_with_a_star = np.zeros((40, 50), dtype=np.uint8)
+    dark_sky_with_a_star[3, 7] = 90
+    dark_sky_with_a_star[25:] = 200
+    assert not nadir_module._lost_rows(dark_sky_with_a_star).any()
 
 
 def test_a_rough_attitude_gives_what_the_coarse_sensors_give(day: tuple[EarthScene, Image]) -> None:
