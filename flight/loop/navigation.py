@@ -340,7 +340,7 @@ class Navigation:
         unusable = without_ns > limit_ns
         text = "readings arrive again"
         if unusable:
-            text = f"bytes but no valid reading for {without_ns * 1e-9:.2f} s: the unit may have restarted"
+            text = f"bytes but no reading for {without_ns * 1e-9:.2f} s: the unit may have restarted"
         self._facts.update(facts.IMU_UNUSABLE, unusable, now_ns, text)
         bad = link.bad_checksum - before.bad_checksum
         stray = link.discarded_bytes - before.discarded_bytes
@@ -472,9 +472,9 @@ class SunSensing:
         self._read_ns = time_ns
 
     def run(self, now_ns: int) -> None:
-        """Accept the newest reading, unless it was accepted before."""
+        """Accept the newest reading, unless it was accepted before or contains a current that is not finite."""
         reading = self._strings.latest()
-        if reading is not None and reading.time_ns > self._read_ns:
+        if reading is not None and reading.time_ns > self._read_ns and np.isfinite(reading.currents).all():
             self._read_ns = reading.time_ns
             if now_ns - reading.time_ns <= self._max_age_ns:
                 wrong = self._accept(reading)

@@ -32,6 +32,7 @@ from knightcube.astro.earth.geomagnetism import extrapolation_sigma, field
 from knightcube.astro.earth.orbit_knowledge import GpsFix, OrbitError, OrbitState, TwoLineElements
 from knightcube.astro.earth.orientation import terrestrial_time
 from knightcube.astro.earth.sun import DAY, UNIX_EPOCH, earth_from_sun, earth_velocity, sunlit_share
+from knightcube.errors import ArgumentError
 from knightcube.gnc.estimation.free_filter import FilterEnvironment
 
 AHEAD, BEHIND = 2.0 * STEP, STEP
@@ -242,7 +243,7 @@ class EstimatedEnvironment:
             fix = GpsFix(date, reading.position, reading.velocity, sigma, speed_sigma)
             self.refusal = self._impossibility(fix)
             used = not self.refusal and self._judge(fix, reading, witness or Witness())
-        except OrbitError as error:
+        except (OrbitError, ArgumentError) as error:
             used, self.refusal = False, str(error)
         self.refused += bool(self.refusal)
         return used

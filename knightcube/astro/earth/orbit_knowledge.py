@@ -118,7 +118,7 @@ class GpsFix:
     longest_age: float = 1500.0
 
     def __post_init__(self) -> None:
-        """Raise OrbitError for impossible values, such as a position inside the Earth."""
+        """Raise OrbitError for impossible orbits, and ArgumentError for an impossible deviation or age."""
         for name in ("position", "velocity"):
             object.__setattr__(self, name, np.asarray(getattr(self, name), dtype=float))
         numbers = np.array([self.julian_date, *self.position, *self.velocity])

@@ -103,6 +103,13 @@ def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLin
     assert found.position == pytest.approx(expected.position, abs=50.0), "the receiver's time, not the host's"
 
 
+def test_a_fix_with_a_negative_standard_deviation_is_refused(elements: TwoLineElements) -> None:
+    known = EstimatedEnvironment(elements, SimClock(UTC_NS))
+    for name in ("sigma", "velocity_sigma"):
+        assert not known.fix(replace(reading(elements, 0), **{name: -1.0}))
+        assert known.refusal.startswith(f"{name}: -1.0")
+
+
 @pytest.mark.parametrize("speed", [0.0, 0.9, 1.5])
 def test_a_fix_with_an_impossible_velocity_is_refused(elements: TwoLineElements, speed: float) -> None:
     """A fix is refused if its orbit would be unbound or below the Earth's surface."""
