@@ -482,7 +482,7 @@ class Served:
 def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
     """Start a device server for a configuration, and end it afterwards.
 
-    Raises NotResponding if the server does not start, or has ended before the flight.
+    Raises NotResponding if the server does not start, or ends before the flight.
     """
     command = [sys.executable, "-m", "sim_hal", "serve", str(config_path), "--folder", str(folder)]
     process = subprocess.Popen(

@@ -354,9 +354,11 @@ def check(packet: Packet, fields: Mapping[str, Any]) -> None:
 def event_problem(name: str) -> str:
     """Return why `name` is not the name of an event, with the most similar name, or "" for an event."""
     names = [kind.name for kind in EVENTS]
+    if name in names:
+        return ""
     close = difflib.get_close_matches(name, names, n=1)
     cure = f"did you mean {close[0]}?" if close else "use a name of the page Events"
-    return "" if name in names else f"is not the name of an event: {cure}"
+    return f"is not the name of an event: {cure}"
 
 
 class CommandPacker:

@@ -472,7 +472,7 @@ class SunSensing:
         self._read_ns = time_ns
 
     def run(self, now_ns: int) -> None:
-        """Accept the newest reading, unless it was accepted before or contains a current that is not finite."""
+        """Accept the newest reading once, unless one of its currents is not finite."""
         reading = self._strings.latest()
         if reading is not None and reading.time_ns > self._read_ns and np.isfinite(reading.currents).all():
             self._read_ns = reading.time_ns

@@ -152,12 +152,13 @@ class PySerialPort:
 
     @contextmanager
     def _held(self) -> Iterator[None]:
-        """Hold the lock of the port. Raises NotResponding while the receiving thread closes a lost port.
+        """Hold the lock of the port. Raises NotResponding if another thread holds it for too long.
 
-        Closing a port can take 30 s, because the kernel waits for the output queue.
+        The receiving thread holds it while it closes a lost port. This can take 30 s, because the kernel
+        waits for the output queue.
         """
         if not self._port_lock.acquire(timeout=self._write_timeout):
-            raise NotResponding(self._device, "the lost port is being closed")
+            raise NotResponding(self._device, "the port is busy, or is being closed")
         try:
             yield
         finally:

@@ -499,7 +499,7 @@ def check_pixels(image: Image) -> None:
             "image", f"{bad} pixels are not finite: replace them, such as by the median of the other pixels"
         )
     if image.dtype.kind == "f" and max(-image.min(), image.max()) > _MOST_LIGHT:
-        raise ArgumentError("image", f"pixels from {image.min():g} to {image.max():g}: divide the image")
+        raise ArgumentError("image", f"pixels from {image.min():g} to {image.max():g}: scale them down")
 
 
 def count_of_floats(image: Image) -> float:

@@ -215,7 +215,7 @@ SLEW: dict[str, Any] = {
         (lambda: LIB.estimate_rate(IMAGE, CAMERA, 1e300), "exposure: 1e.300: give 1e-06 to 100000 seconds"),
         (lambda: LIB.detect_objects(IMAGE, CAMERA, [0, 0, 1], 1e-9), "exposure: 1e-09: give"),
         (lambda: LIB.StarTracker(camera=CAMERA).solve(IMAGE, exposure=1e9), "exposure: 1e.09: give"),
-        (lambda: LIB.find_nadir(1e200 * (1.0 + IMAGE), CAMERA), "image: pixels from .* divide the image"),
+        (lambda: LIB.find_nadir(1e200 * (1.0 + IMAGE), CAMERA), "image: pixels from .* scale them down"),
         (
             lambda: LIB.detect_objects(IMAGE, CAMERA, [0, 0, 1], 1.0, {}),
             "settings: {}: .* ObjectSettings",

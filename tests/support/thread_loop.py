@@ -13,9 +13,9 @@ from knightcube.gnc.guidance.plant import PathSample, SingleAxisPlant
 from tests.knightcube.gnc.estimation.single_axis import (
     ANGLE,
     RATE,
-    AttitudeFilterSettings,
     Measurement,
     SingleAxisFilter,
+    SingleAxisSettings,
 )
 
 PERIOD = 0.025
@@ -37,7 +37,7 @@ def fly(
     previous cycle's command, with the uncertainty of the testbed.
     """
     rng = np.random.default_rng(seed)
-    filter_ = SingleAxisFilter(BELIEVED, AttitudeFilterSettings(2e-3, PERIOD, 5e-4))
+    filter_ = SingleAxisFilter(BELIEVED, SingleAxisSettings(2e-3, PERIOD, 5e-4))
     angle, rate = start
     current, rows = 0.0, []
     for cycle in range(round(duration / PERIOD)):

@@ -532,7 +532,7 @@ class Transmitter:
         counts = {line.name: line.send(frames, now_ns) for line in self._lines}
         taken = [count for count in counts.values() if count is not None]
         self.untaken += sum(len(frames) - count for count in taken)
-        if taken or self._listened:  # otherwise the frames contain live telemetry only
+        if taken or self._listened:  # otherwise the frames in `due` contain live telemetry only
             self._unsent = frames[max(taken, default=0) :]
         self._listened = bool(taken)
         if frames:

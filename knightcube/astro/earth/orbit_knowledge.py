@@ -230,7 +230,8 @@ class TwoLineElements:
         """Return the orbit state at a Julian date UTC.
 
         Raises OrbitError if SGP4 fails, or if the standard deviation of the position exceeds `LARGEST_SIGMA`
-        because the date is too far from the epoch of the elements.
+        because the date is too far from the epoch of the elements. Raises ArgumentError for a date before
+        1858 or after 2999.
         """
         if not _DATES[0] <= julian_date <= _DATES[1]:
             raise ArgumentError("julian_date", f"{brief(julian_date)}: give a Julian date from 1858 to 2999")

@@ -57,8 +57,8 @@ class IoctlCamera:
         held_ns: delay of the frames, ns.
         automatic_gain: gain after automatic exposure has been switched off.
         stubborn: values of controls that accept each value, but do not keep it.
-        intervals_ns: permitted intervals of frames, of which the nearest is chosen; if empty, any interval
-            is.
+        intervals_ns: permitted intervals of frames, of which the nearest is chosen; if empty, each interval
+            is permitted.
         bandwidth: whether the USB bus has enough bandwidth left for the frames.
         draws: whether each frame has its own pattern; otherwise the buffer keeps its old content.
     """

@@ -261,7 +261,7 @@ def test_two_line_elements_are_those_of_sgp4() -> None:
 
 
 def test_an_orbit_at_times_in_any_order_is_integrated_once(monkeypatch: pytest.MonkeyPatch) -> None:
-    """In their order, times that alternate between the ends of a month would take thirty days each."""
+    """The integration goes through the times in increasing order, instead of back and forth."""
     times = np.array([5000.0, -3000.0, 0.0, 9000.0, -100.0, 5000.0])
     lengths: list[float] = []
 

@@ -105,8 +105,12 @@ def test_without_elements_nothing_is_known_before_the_first_fix(elements: TwoLin
 
 def test_a_fix_with_a_negative_standard_deviation_is_refused(elements: TwoLineElements) -> None:
     known = EstimatedEnvironment(elements, SimClock(UTC_NS))
-    for name in ("sigma", "velocity_sigma"):
-        assert not known.fix(replace(reading(elements, 0), **{name: -1.0}))
+    sound = reading(elements, 0)
+    for name, false in (
+        ("sigma", replace(sound, sigma=-1.0)),
+        ("velocity_sigma", replace(sound, velocity_sigma=-1.0)),
+    ):
+        assert not known.fix(false)
         assert known.refusal.startswith(f"{name}: -1.0")
 
 

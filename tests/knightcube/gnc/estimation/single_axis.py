@@ -58,7 +58,7 @@ class SingleAxisEstimate:
 
 
 @dataclass(frozen=True, slots=True)
-class AttitudeFilterSettings:
+class SingleAxisSettings:
     """Noise and limits of the filter.
 
     Attributes:
@@ -94,7 +94,7 @@ class SingleAxisFilter:
     REJECTIONS_TO_RESTART = 40
     """Number of refused measurements in a row after which the filter restarts."""
 
-    def __init__(self, plant: SingleAxisPlant, settings: AttitudeFilterSettings) -> None:
+    def __init__(self, plant: SingleAxisPlant, settings: SingleAxisSettings) -> None:
         self._plant = plant
         self._settings = settings
         gain = plant.torque_constant / plant.inertia

@@ -8,12 +8,12 @@ import numpy as np
 
 from knightcube.astro.arrays import FloatArray
 from knightcube.gnc.guidance.plant import SingleAxisPlant
-from tests.knightcube.gnc.estimation.single_axis import ANGLE, RATE, AttitudeFilterSettings, Measurement
+from tests.knightcube.gnc.estimation.single_axis import ANGLE, RATE, Measurement, SingleAxisSettings
 
 PLANT = SingleAxisPlant(inertia=1.05e-3, torque_constant=2.916e-4, resistance=23.0, current_limit=0.148)
 
 
-SETTINGS = AttitudeFilterSettings(current_noise=2.02e-3, control_period=0.025, disturbance_walk=5e-4)
+SETTINGS = SingleAxisSettings(current_noise=2.02e-3, control_period=0.025, disturbance_walk=5e-4)
 
 
 PERIOD = 25_000_000
