@@ -113,11 +113,8 @@ class LikelihoodSettings:
 
     @property
     def shutter_unstated(self) -> bool:
-        """Whether the shutter may be a rolling shutter because its type is unknown.
-
-        A stated covariance of the lens parameters includes the line time.
-        """
-        return self.knowledge.covariance is None and self.line_time is None and self.line_time_sigma > 0.0
+        """Whether the shutter may be a rolling shutter because its type is unknown."""
+        return self.line_time is None and self.line_time_sigma > 0.0
 
     def binned(self, size: int) -> LikelihoodSettings:
         """Return the settings for frames that are binned by `size` px, with the line time of binned rows."""

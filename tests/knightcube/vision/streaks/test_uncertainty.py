@@ -118,8 +118,6 @@ def test_a_shutter_counts_as_unstated_unless_line_time_or_accuracy_is_given() ->
     assert LikelihoodSettings().shutter_unstated
     assert not LikelihoodSettings(line_time=0.0).shutter_unstated
     assert not LikelihoodSettings(knowledge=EXACT).shutter_unstated
-    correlated = CameraKnowledge(covariance=tuple(map(tuple, np.eye(5).tolist())))
-    assert not LikelihoodSettings(knowledge=correlated).shutter_unstated
     known = replace(CameraKnowledge(), line_time=3e-6)
     assert LikelihoodSettings(line_time=2e-5, knowledge=known).line_time_sigma == 3e-6
 
