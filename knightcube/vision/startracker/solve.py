@@ -406,8 +406,7 @@ def solve_motion(
         return solution
     covariance = solution.fix.covariance + timing_covariance(motion)
     fix = replace(solution.fix, covariance=covariance)
-    solution = replace(solution, fix=fix, psf_sigma=motion.psf_sigma)
-    return _in_one_piece(solution, motion.flux[chosen], sky, prior)
+    return replace(solution, fix=fix, psf_sigma=motion.psf_sigma)
 
 
 def points_near(
@@ -462,7 +461,8 @@ def solve_near(
         return None
     solution = _with_attitude(seen, near, sky, settings)
     solution = _beside_companions(solution, found, camera, scale, sky, settings)
-    solution = _in_one_piece(_shape_unknown(solution, found, settings), found.flux, sky, prior)
+    solution = _shape_unknown(solution, found, settings)
+    solution = _in_one_piece(solution, found.flux, sky, prior) if trails is None else solution
     return solution if _agrees(solution, prior) else None
 
 
@@ -570,7 +570,8 @@ def _in_one_piece(
     """Return the solution; the attitude is refused or less certain if a part of the rows is displaced.
 
     See `torn_frames`. The argument `flux` contains the flux (n,) of each point. Stars at another attitude
-    that contradicts the prior do not make the attitude ambiguous.
+    that contradicts the prior do not make the attitude ambiguous. Frames of a rotating camera are not
+    examined, because an uneven rotation displaces stars too.
     """
     if solution.fix is None:
         return solution
