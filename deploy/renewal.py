@@ -913,7 +913,7 @@ class Renewal:
                     board.remove(name)
 
     def _tidy(self) -> None:
-        """Remove releases and configurations that are no longer needed."""
+        """Remove the releases and configurations to which no step returns."""
         board = self._board
         with suppress(OSError):
             named_releases = {board.linked("current"), board.linked("previous")}
@@ -923,7 +923,7 @@ class Renewal:
             self._tidy_kept()
 
     def _tidy_kept(self) -> None:
-        """Remove stored configurations and catalogues that are no longer needed. Raises OSError."""
+        """Remove the stored configurations and catalogues to which no step returns. Raises OSError."""
         state, board = self._state, self._board
         texts = [(board.kept / name / CONFIGURATION) for name in (state.previous, GROUND)]
         named = b"".join(path.read_bytes() for path in (*texts, board.configuration) if path.is_file())

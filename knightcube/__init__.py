@@ -36,8 +36,8 @@ if TYPE_CHECKING:
     from knightcube.gnc.control.detumble import Detumbler as Detumbler
     from knightcube.gnc.control.detumble import DetumblerSettings as DetumblerSettings
     from knightcube.gnc.control.detumble import WindowSchedule as WindowSchedule
+    from knightcube.gnc.control.pointing_job import plan_pointing as plan_pointing
     from knightcube.gnc.control.pointing_law import PointingLaw as PointingLaw
-    from knightcube.gnc.control.pointing_law import plan_pointing as plan_pointing
     from knightcube.gnc.control.pointing_table import PointingWeights as PointingWeights
     from knightcube.gnc.estimation.attitude_filter import AttitudeFilter as AttitudeFilter
     from knightcube.gnc.estimation.attitude_filter import AttitudeFilterSettings as AttitudeFilterSettings
@@ -119,7 +119,7 @@ _MODULE_OF = {
     "magnetic_field": "knightcube.astro.almanac",
     "magnetic_field_on_ground": "knightcube.astro.almanac",
     "orbit_state": "knightcube.astro.almanac",
-    "plan_pointing": "knightcube.gnc.control.pointing_law",
+    "plan_pointing": "knightcube.gnc.control.pointing_job",
     "plan_slew": "knightcube.gnc.guidance.slew_plan",
     "plan_step": "knightcube.gnc.guidance.vmc",
     "propagate_elements": "knightcube.astro.almanac",

@@ -482,7 +482,7 @@ class Served:
 def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Served]:
     """Start a device server for a configuration, and end it afterwards.
 
-    Raises NotResponding if the server does not start, or ends before the flight.
+    Raises NotResponding if the server does not start, or ends while the flight still uses it.
     """
     command = [sys.executable, "-m", "sim_hal", "serve", str(config_path), "--folder", str(folder)]
     process = subprocess.Popen(
@@ -502,9 +502,8 @@ def started_server(config_path: Path, seed: int, folder: Path) -> Iterator[Serve
             try:
                 yield served
             except OSError:
-                with suppress(
-                    subprocess.TimeoutExpired
-                ):  # a server that is ending has closed its connections
+                # A server that is ending has closed its connections.
+                with suppress(subprocess.TimeoutExpired):
                     process.wait(timeout=5.0)
                 if process.returncode is None:
                     raise

@@ -19,13 +19,17 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, field, replace
+from datetime import datetime
 
 import numpy as np
+from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import FloatArray
-from knightcube.astro.earth.disturbance import Pressures, pressures, shapes
+from knightcube.astro.arrays import FloatArray, check_type, finite_array, unit_quaternion
+from knightcube.astro.earth.disturbance import SIZES, Pressures, box_areas, pressures, shapes
 from knightcube.astro.earth.ephemeris import Ephemeris, predict
 from knightcube.astro.earth.orbit_knowledge import OrbitState
+from knightcube.astro.earth.sun import julian_date
+from knightcube.astro.inertia import checked_inertia
 from knightcube.astro.quaternion import (
     angle_between,
     attitude_matrix,
@@ -34,7 +38,8 @@ from knightcube.astro.quaternion import (
     multiply,
     to_rotation_vector,
 )
-from knightcube.errors import PlanningError
+from knightcube.errors import ArgumentError, PlanningError
+from knightcube.gnc.control.pointing_law import PointingLaw
 from knightcube.gnc.control.pointing_path import CostToGo, SweepCost, linearised, sweep
 from knightcube.gnc.control.pointing_table import (
     PointingPreview,
@@ -61,8 +66,17 @@ from knightcube.gnc.guidance.slew_model import (
     SlewTask,
     along,
     cones,
+    heat_matrix,
 )
-from knightcube.gnc.guidance.slew_plan import SlewPlan, end_law, plan_near, plan_task
+from knightcube.gnc.guidance.slew_plan import (
+    SlewPlan,
+    body_axes,
+    check_target,
+    end_law,
+    known_orbit,
+    plan_near,
+    plan_task,
+)
 
 PlanTask = Callable[[SlewTask, SlewPath | None], SlewPlan]
 """Function that plans a task, starting from the path of a similar task if given (`slew_plan.plan_task`)."""
@@ -414,7 +428,7 @@ STEADY, PASSING = TableSpan(7_200.0, 1_800.0, 10.0), TableSpan(120.0, 60.0, 2.0)
 """Spans of tables for targets of unlimited duration (first value) and for a passing object (second value)."""
 _COVERED = 1.25
 """Minimum length of the prediction for a target of unlimited duration, in revolutions of the orbit."""
-LONGEST_PREVIEW = 10_000.0
+_LONGEST = 10_000.0
 """Longest prediction (s), a revolution and a quarter at an altitude of 2,200 km."""
 LEAD = 2.0
 """Time (s) between the estimated state and the start of the table, during which the table is computed."""
@@ -504,7 +518,7 @@ def new_table(job: PointingJob) -> PointingTable:
     span = job.span
     preview = span.preview
     if span is STEADY:
-        preview = min(max(preview, _COVERED * job.orbit.period), LONGEST_PREVIEW)
+        preview = min(max(preview, _COVERED * job.orbit.period), _LONGEST)
     ahead = predict(job.orbit, preview + 4.0 * STEADY.step)
     times = np.arange(LEAD, preview, span.step)
     kept = round(span.kept / span.step)
@@ -536,3 +550,54 @@ def new_table(job: PointingJob) -> PointingTable:
         if path is not None:
             return slew_table(begin, path, wish.residual, job.target, job.axes, ahead, found, job.weights)
     return pointing_table(found, job.inertia, job.limit, job.weights)
+
+
+def plan_pointing(
+    *,
+    inertia: ArrayLike,
+    dipole_limit: ArrayLike,
+    elements: tuple[str, str],
+    time: datetime,
+    target: PointingTarget,
+    quaternion: ArrayLike,
+    rate: ArrayLike,
+    weights: PointingWeights,
+    pointing_axis: ArrayLike = (0.0, 0.0, 1.0),
+    across_axis: ArrayLike = (1.0, 0.0, 0.0),
+) -> PointingLaw:
+    """Return the pointing law of a satellite with torque coils alone, from its motion at `time` to a target.
+
+    The law is a planned path to the target with feedback gains, computed from the magnetic field and the
+    gravity gradient that are predicted along the orbit by SGP4. Its times are in s after `time`; its `span`
+    begins two seconds after `time`, because a plan takes about a second, and covers half an hour. Plan again
+    every few minutes from the newest estimates.
+
+    Args:
+        inertia: symmetric inertia tensor (3, 3) in body axes, kg m^2, or the principal moments (3,).
+        dipole_limit: dipole limits (3,) of the coils along the body axes, A m^2.
+        elements: two lines of the two-line element set of the orbit, with an epoch near `time`.
+        time: datetime of the motion, in UTC or with a time zone.
+        target: pointing target. If its roll is free, the body keeps its roll angle.
+        quaternion: attitude (4,) at `time`, from ICRS into body axes, scalar last.
+        rate: body rate (3,) at `time`, rad/s.
+        weights: weights of errors and dipole moment, for a 1U CubeSat 0.0175 rad, 1 rad/s and 3e-4 A m^2.
+        pointing_axis: body axis (3,), of any length, that points to the target.
+        across_axis: body axis (3,), of any length, from which a roll is measured.
+
+    Raises:
+        UsageError: if an argument is invalid; the message gives the argument, its value and the remedy.
+        OrbitError: if `time` is too far from the epoch of the elements (see `propagate_elements`).
+        GeomagneticError: if the path is outside the years 2025 to 2030 of the magnetic field model.
+    """
+    tensor = checked_inertia("inertia", heat_matrix(finite_array("inertia", inertia, (3, 3), (3,))))
+    limit = finite_array("dipole_limit", dipole_limit, (3,))
+    if limit.min() <= 0.0:
+        raise ArgumentError("dipole_limit", f"{limit.tolist()}: give limits above zero A m^2")
+    check_target("target", target)
+    check_type("weights", weights, PointingWeights)
+    q, w = unit_quaternion("quaternion", quaternion), finite_array("rate", rate, (3,))
+    axes, none = body_axes(pointing_axis, across_axis), np.zeros(SIZES)
+    orbit = known_orbit(elements, time, _LONGEST).at(julian_date(time))
+    areas = box_areas(tensor)
+    job = PointingJob(0, 0, orbit, tensor, axes, weights, target, q, w, none, limit, areas)
+    return PointingLaw(new_table(job), limit)

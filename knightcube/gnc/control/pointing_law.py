@@ -11,32 +11,22 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass
-from datetime import datetime
 
 import numpy as np
-from numpy.typing import ArrayLike
 
-from knightcube.astro.arrays import FloatArray, check_finite, check_type, cross_product, finite_array
-from knightcube.astro.earth.disturbance import SIZES, box_areas
-from knightcube.astro.earth.sun import julian_date
-from knightcube.astro.inertia import checked_inertia
+from knightcube.astro.arrays import FloatArray, check_finite, cross_product
 from knightcube.astro.quaternion import (
     attitude_matrix,
     conjugate,
     from_rotation_vector,
     multiply,
-    normalise,
     to_rotation_vector,
 )
 from knightcube.errors import ArgumentError
 from knightcube.gnc.control.coil_map import limited
-from knightcube.gnc.control.pointing_job import LONGEST_PREVIEW, PointingJob, new_table
-from knightcube.gnc.control.pointing_table import PointingTable, PointingWeights
+from knightcube.gnc.control.pointing_table import PointingTable
 from knightcube.gnc.estimation.estimate import of_unit_length
 from knightcube.gnc.guidance.attitude_law import AttitudeReference
-from knightcube.gnc.guidance.pointing_target import PointingTarget
-from knightcube.gnc.guidance.slew_model import heat_matrix
-from knightcube.gnc.guidance.slew_plan import body_axes, check_target, known_orbit
 
 LARGEST_ROTATION = math.radians(20.0)
 """Largest rotation error (rad) that the pointing law uses. Larger errors are scaled down to this value,
@@ -61,8 +51,8 @@ class PointingCommand:
 class PointingLaw:
     """The feedback law that computes dipole moments from a pointing table.
 
-    `plan_pointing` plans a path to a target and returns the law. The times of the law are in s after the time
-    of the plan.
+    `pointing_job.plan_pointing` plans a path to a target and returns the law. The times of the law are in s
+    after the time of the plan.
     """
 
     def __init__(self, table: PointingTable, limit: float | FloatArray) -> None:
@@ -124,58 +114,6 @@ class PointingLaw:
         if not math.isfinite(float(dipole @ dipole)):  # one check per cycle instead of one for each argument
             check_finite(quaternion=quaternion, rate=rate, residual_dipole=residual_dipole, sizes=sizes)
         return PointingCommand(limited(dipole, self._limit), rotation, missed)
-
-
-def plan_pointing(
-    *,
-    inertia: ArrayLike,
-    dipole_limit: ArrayLike,
-    elements: tuple[str, str],
-    time: datetime,
-    target: PointingTarget,
-    quaternion: ArrayLike,
-    rate: ArrayLike,
-    weights: PointingWeights,
-    pointing_axis: ArrayLike = (0.0, 0.0, 1.0),
-    across_axis: ArrayLike = (1.0, 0.0, 0.0),
-) -> PointingLaw:
-    """Return the pointing law of a satellite with torque coils alone, from its motion at `time` to a target.
-
-    The law is a planned path to the target with feedback gains, computed from the magnetic field and the
-    gravity gradient that are predicted along the orbit by SGP4. Its times are in s after `time`; its `span`
-    begins two seconds after `time`, because a plan takes about a second, and covers half an hour. Plan again
-    every few minutes from the newest estimates.
-
-    Args:
-        inertia: symmetric inertia tensor (3, 3) in body axes, kg m^2, or the principal moments (3,).
-        dipole_limit: dipole limits (3,) of the coils along the body axes, A m^2.
-        elements: two lines of the two-line element set of the orbit, with an epoch near `time`.
-        time: datetime of the motion, in UTC or with a time zone.
-        target: pointing target. If its roll is free, the body keeps its roll angle.
-        quaternion: attitude (4,) at `time`, from ICRS into body axes, scalar last.
-        rate: body rate (3,) at `time`, rad/s.
-        weights: weights of errors and dipole moment, for a 1U CubeSat 0.0175 rad, 1 rad/s and 3e-4 A m^2.
-        pointing_axis: body axis (3,), of any length, that points to the target.
-        across_axis: body axis (3,), of any length, from which a roll is measured.
-
-    Raises:
-        UsageError: if an argument is invalid; the message gives the argument, its value and the remedy.
-        OrbitError: if `time` is too far from the epoch of the elements (see `propagate_elements`).
-        GeomagneticError: if the path is outside the years 2025 to 2030 of the magnetic field model.
-    """
-    tensor = checked_inertia("inertia", heat_matrix(finite_array("inertia", inertia, (3, 3), (3,))))
-    limit = finite_array("dipole_limit", dipole_limit, (3,))
-    if limit.min() <= 0.0:
-        raise ArgumentError("dipole_limit", f"{limit.tolist()}: give limits above zero A m^2")
-    check_target("target", target)
-    check_type("weights", weights, PointingWeights)
-    q = of_unit_length("quaternion", finite_array("quaternion", quaternion, (4,)))
-    w = finite_array("rate", rate, (3,))
-    axes, none = body_axes(pointing_axis, across_axis), np.zeros(SIZES)
-    orbit = known_orbit(elements, time, LONGEST_PREVIEW).at(julian_date(time))
-    areas = box_areas(tensor)
-    job = PointingJob(0, 0, orbit, tensor, axes, weights, target, normalise(q), w, none, limit, areas)
-    return PointingLaw(new_table(job), limit)
 
 
 def _square(field: FloatArray) -> float:

@@ -14,10 +14,9 @@ import numpy as np
 import numpy.typing as npt
 from scipy.special import gammaincinv
 
-from knightcube.astro.arrays import FloatArray, finite_array, real_number
+from knightcube.astro.arrays import FloatArray, finite_array, real_number, unit_quaternion
 from knightcube.astro.quaternion import conjugate, multiply, to_rotation_vector
 from knightcube.errors import ArgumentError
-from knightcube.gnc.estimation.estimate import of_unit_length
 
 
 def attitude_error(true: npt.ArrayLike, estimated: npt.ArrayLike) -> FloatArray:
@@ -32,8 +31,8 @@ def attitude_error(true: npt.ArrayLike, estimated: npt.ArrayLike) -> FloatArray:
     Raises:
         ArgumentError: if an argument is not a unit quaternion.
     """
-    p, q = finite_array("true", true, (4,)), finite_array("estimated", estimated, (4,))
-    return to_rotation_vector(multiply(of_unit_length("true", p), conjugate(of_unit_length("estimated", q))))
+    p, q = unit_quaternion("true", true), unit_quaternion("estimated", estimated)
+    return to_rotation_vector(multiply(p, conjugate(q)))
 
 
 @dataclass(frozen=True, slots=True, eq=False)

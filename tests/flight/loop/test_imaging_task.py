@@ -636,7 +636,7 @@ def test_a_low_battery_leaves_nearly_the_given_time_between_two_exposures() -> N
 
 @pytest.mark.parametrize(("every", "made"), [(1, 16), (3, 5), (4, 4), (8, 2), (99, 2), (0, 16)])
 def test_under_overload_every_nth_exposure_is_made_up_to_a_limit(every: int, made: int) -> None:
-    """Of the due exposures, the camera makes every n-th, but at least every eighth."""
+    """The camera makes every n-th of the due exposures, but at least every eighth."""
     bench = Bench(most_every=8)
     bench.task.reduce(True, every)
     for second in range(1, 17):

@@ -559,7 +559,7 @@ def test_distances_from_a_circle_have_their_derivatives() -> None:
 
 
 def _disc(radius_deg: float, used: int, points: int, endless: int, residual_px: float, stretch: float) -> str:
-    """Return what is wrong with a disc in a camera of 700 px/rad whose second axis is stretched."""
+    """Return the problem of a disc in a camera of 700 px/rad with a stretched second axis."""
     scale = np.diag([700.0, 700.0 * stretch])
     per_radian = 700.0 * np.sqrt(stretch)
     mask = np.arange(points) < used

@@ -63,11 +63,11 @@ def submitted(
     *,
     requested: bool,
     usable: BoolArray = ALL,
-    told: list[str] | None = None,
+    texts: list[str] | None = None,
 ) -> list[PointingJob]:
     """Return the jobs that a planner submits for a goal if only the given coils (n,) are usable.
 
-    The texts of the planner's events are appended to `told`.
+    The texts of the planner's events are appended to `texts`.
     """
     jobs: list[PointingJob] = []
 
@@ -77,7 +77,7 @@ def submitted(
 
     services = SimpleNamespace(
         jobs=SimpleNamespace(submit=submit),
-        events=SimpleNamespace(report=lambda _, __, text: told.append(text) if told is not None else None),
+        events=SimpleNamespace(report=lambda _, __, text: texts.append(text) if texts is not None else None),
     )
     craft = PlannedCraft(INERTIA, BodyAxes(Z, X), WEIGHTS, COILS, 0.5, WISH)
     planner = PointingPlanner(
@@ -114,11 +114,11 @@ def test_slews_are_planned_with_the_coils_that_are_not_isolated(paths: PointingP
 
 
 def test_a_slew_is_refused_with_its_reason_if_one_coil_works(paths: PointingPaths) -> None:
-    told: list[str] = []
+    texts: list[str] = []
     usable = np.array([False, False, True])
-    assert submitted(paths, SUN, 0, requested=True, usable=usable, told=told) == []
-    assert len(told) == 1
-    assert told[0].startswith("no plan: all coils lie along [0.00, 0.00, 1.00]")
+    assert submitted(paths, SUN, 0, requested=True, usable=usable, texts=texts) == []
+    assert len(texts) == 1
+    assert texts[0].startswith("no plan: all coils lie along [0.00, 0.00, 1.00]")
 
 
 def test_a_path_that_leaves_its_target_for_a_time_does_not_start_a_slew(

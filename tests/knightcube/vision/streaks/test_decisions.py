@@ -505,8 +505,7 @@ def test_a_vibration_is_fitted_only_if_no_guess_is_convincing_without_one(
     again = Asked({0.1: (5e3, True, 0.11), 0.3: (6e3, True, 0.31)})
     found = _searched(monkeypatch, [wrong, sure], [], disturbed=again)
     assert found[0] == 0.2
-    # Of the fits whose residuals may show a vibration, the likeliest is tried first, even if it is
-    # convincing.
+    # The most likely fit whose residuals may show a vibration is tried first, even if it is convincing.
     asked.clear()
     doubtful = (5e3, True, 0.3)
     assert _searched(monkeypatch, [wrong, doubtful], [], disturbed=again)[0] == 0.31

@@ -397,8 +397,8 @@ def test_the_light_of_the_whole_frame_gives_the_angle_about_an_approximate_axis(
     scene = real_sky(34, np.radians(theta), length, 0.2)
     frame = reduce_frame(scene.pixels, SATURATION, 1.0)
     turn = scene.rate * scene.exposure
-    told = frame_angles(frame, CAMERA.pinhole, turn + 0.002 * np.linalg.norm(turn), 2, cap)
-    assert abs(told[0] / np.linalg.norm(turn) - 1.0) < 0.08
+    angles = frame_angles(frame, CAMERA.pinhole, turn + 0.002 * np.linalg.norm(turn), 2, cap)
+    assert abs(angles[0] / np.linalg.norm(turn) - 1.0) < 0.08
 
 
 @pytest.mark.parametrize("width", [5, 485, 534])
